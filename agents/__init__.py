@@ -1,0 +1,1 @@
+"""The robot: its plant and its torque loop."""

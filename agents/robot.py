@@ -1,0 +1,87 @@
+"""The robot as a role: it says its state, hears one acceleration, and moves under its own torque loop until the next.
+
+The torque loop runs at its own period inside the robot.  What it did in a period travels with the state at its end:
+one message, where a separate one for torque would cost every delivery twice.
+"""
+
+from collections.abc import Sequence
+from math import cos, nan, sin
+
+import numpy as np
+
+from agents.plant import LOST, RobotState, make_step
+from agents.torque import TorqueLimits, make_inverse
+from echelon.messages import Channel, Heard, Message
+from echelon.plan import Plan
+from echelon.role import Input, Stage
+
+
+class Robot:
+    """One robot of a plan."""
+
+    def __init__(self, plan: Plan, index: int) -> None:
+        robot = plan.robots[index]
+        self.index = index
+        self._plan = robot
+        self._step = make_step(robot)
+        self._inverse = make_inverse(robot)
+        self._limits = TorqueLimits(
+            robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit, robot.wheel_radius, robot.arm
+        )
+        self._limited = any(limit != float("inf") for limit in (robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit))
+        self._inner = robot.period_ns // robot.torque_period_ns
+        self._h = robot.torque_period_ns * 1e-9
+        self._at = 2 * robot.child_number
+        self.state = RobotState(*robot.start, robot.heading, 0.0, 0.0)
+        self._did = (0.0,) * 9
+        deepest = max(node.depth for node in plan.nodes)
+        self.stages = (
+            Stage("say", 0, robot.period_ns, (), self._say),
+            Stage("move", 2 * deepest + 3, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
+        )
+
+    def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Returns the state at `time_ns`."""
+        x, y, theta, v, omega = self.state.x, self.state.y, self.state.theta, self.state.v, self.state.omega
+        c, s, across = cos(theta), sin(theta), self._plan.offset * omega
+        values = np.array((x, y, v * c - across * s, v * s + across * c, theta, v, omega, *self._did))
+        return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
+
+    def _move(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Moves to the end of the period that begins at `time_ns`, with the acceleration heard; zero torque if none."""
+        command = heard[0]
+        if command is None:
+            ax = ay = 0.0
+        else:
+            ax, ay = command.values[self._at : self._at + 2].tolist()
+        try:
+            self._advance(ax, ay, command is not None)
+        except (ValueError, OverflowError):  # the run diverged: angles and speeds beyond what floats can hold
+            self.state = LOST
+            self._did = (ax, ay, nan, nan, nan, nan, nan, nan, 0.0)
+        return ()
+
+    def _advance(self, ax: float, ay: float, commanded: bool) -> None:
+        """Runs the torque loop and the plant through one period."""
+        h, state, step, inverse, limits = self._h, self.state, self._step, self._inverse, self._limits
+        right_sum = left_sum = right_square = left_square = right_peak = left_peak = 0.0
+        saturated = 0
+        right = left = 0.0
+        for _ in range(self._inner):
+            if commanded:
+                right, left = inverse(state, ax, ay, 0.5 * h)
+            if self._limited:
+                right, left, limited = limits.apply(right, left, state.v, state.omega, h)
+                saturated += limited
+            state = step(state, right, left, h)
+            right_sum += right
+            left_sum += left
+            right_square += right * right
+            left_square += left * left
+            right_peak = max(right_peak, abs(right))
+            left_peak = max(left_peak, abs(left))
+        self.state = state
+        n = self._inner
+        self._did = (
+            ax, ay, right_sum / n, left_sum / n, right_square / n, left_square / n, right_peak, left_peak, float(saturated),
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""The tree node: centroid-based transformation, control laws, trajectories, collision avoidance."""

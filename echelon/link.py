@@ -1,0 +1,149 @@
+"""The link model: which message a receiver may use at a given instant.
+
+Every directed pair (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is lost,
+and how long it takes, is a pure function of (scenario seed, link, k): the same messages are lost in every engine, at
+every speed and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key names the
+link, the counter the message, so any draw can be made without the ones before it.
+
+A message is used at the first tick at or after its arrival, and the newest that has arrived is the one in use
+(policy *hold*): one that is overtaken arrives, but changes nothing.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from typing import Final
+
+import numpy as np
+from numpy.random import Philox
+
+from echelon.messages import Channel
+from echelon.plan import LinkPlan
+
+_BLOCK: Final = 512
+"""Messages per block of draws; each takes two 64-bit words, and one count of the Philox counter gives four."""
+
+
+def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
+    """Returns the 128-bit Philox key of a link in a scenario."""
+    name = f"{seed}|{source}|{receiver}|{channel.name}".encode()
+    return int.from_bytes(hashlib.blake2b(name, digest_size=16).digest(), "little")
+
+
+def draws(key: int, block: int) -> np.ndarray:
+    """Returns uniform numbers in [0, 1), shape (_BLOCK, 2): for each message of the block its loss and its delay draw."""
+    words = Philox(key=key, counter=block * (_BLOCK // 2)).random_raw(2 * _BLOCK)
+    return ((words >> np.uint64(11)) * 2.0**-53).reshape(_BLOCK, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkCounts:
+    """What became of a link's messages; sent = delivered + lost + in flight.  Ages [ns] are of what was in use, at each
+    use; `held` counts the uses of a message that had been used before."""
+
+    source: int
+    receiver: int
+    channel: Channel
+    sent: int
+    delivered: int
+    lost: int
+    in_flight: int
+    used: int
+    held: int
+    age_mean_ns: float
+    age_max_ns: int
+
+
+class Link:
+    """One directed link with its state; `newest` must be asked for instants in ascending order."""
+
+    __slots__ = (
+        "_age_max",
+        "_age_sum",
+        "_block",
+        "_block_number",
+        "_delivered",
+        "_flying",
+        "_held",
+        "_ideal",
+        "_key",
+        "_last",
+        "_lost",
+        "_newest",
+        "_sent",
+        "_used",
+        "plan",
+    )
+
+    def __init__(self, plan: LinkPlan, seed: int, source: str, receiver: str) -> None:
+        self.plan = plan
+        self._key = link_key(seed, source, receiver, plan.channel)
+        self._ideal = plan.ideal
+        self._block: list[list[float]] = []
+        self._block_number = -1
+        self._sent = self._delivered = self._lost = self._used = self._held = 0
+        self._newest = self._last = -1
+        self._flying: list[tuple[int, int]] = []
+        self._age_sum = self._age_max = 0
+
+    def fate(self, sequence: int) -> int | None:
+        """Returns the delay [ns] of message number `sequence`, or None if it is lost."""
+        plan = self.plan
+        if self._ideal:
+            return 0
+        number, at = divmod(sequence, _BLOCK)
+        if number != self._block_number:
+            self._block, self._block_number = draws(self._key, number).tolist(), number
+        loss, delay = self._block[at]
+        if loss < plan.loss:
+            return None
+        return plan.delay_min_ns + round(delay * (plan.delay_max_ns - plan.delay_min_ns))
+
+    def newest(self, time_ns: int) -> int:
+        """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
+        period = self.plan.period_ns
+        if self._ideal:
+            self._newest = time_ns // period
+            return self._newest
+        while self._sent * period <= time_ns:
+            delay = self.fate(self._sent)
+            if delay is None:
+                self._lost += 1
+            else:
+                heappush(self._flying, (self._sent * period + delay, self._sent))
+            self._sent += 1
+        while self._flying and self._flying[0][0] <= time_ns:
+            _, sequence = heappop(self._flying)
+            self._delivered += 1
+            self._newest = max(self._newest, sequence)
+        return self._newest
+
+    def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
+        """Counts one use, at `time_ns`, of the message that was sent at `sent_ns`."""
+        self._used += 1
+        if sequence == self._last:
+            self._held += 1
+        self._last = sequence
+        age = time_ns - sent_ns
+        self._age_sum += age
+        if age > self._age_max:
+            self._age_max = age
+
+    def counts(self) -> LinkCounts:
+        """Returns what became of the messages up to the last instant asked for."""
+        sent, delivered = self._sent, self._delivered
+        if self._ideal:
+            sent = delivered = self._newest + 1
+        return LinkCounts(
+            self.plan.source,
+            self.plan.receiver,
+            self.plan.channel,
+            sent,
+            delivered,
+            self._lost,
+            len(self._flying),
+            self._used,
+            self._held,
+            self._age_sum / self._used if self._used else 0.0,
+            self._age_max,
+        )

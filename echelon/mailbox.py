@@ -1,0 +1,80 @@
+"""The mailbox: between messages as they come and a role's stages as they want them.
+
+Data flow makes the lockstep: at time t a stage needs, of each input, exactly the message its link says is in use at t.
+The link knows that number without having seen the message, so the mailbox can say what is still missing, and a stage
+that runs has heard the same whatever the order, the speed or the process in which messages came.
+"""
+
+from dataclasses import dataclass, field
+
+from echelon.link import Link, LinkCounts
+from echelon.messages import Heard, Message
+from echelon.plan import Plan
+from echelon.role import Input, Role
+
+
+@dataclass(slots=True)
+class _Slot:
+    """One input: its link, the message in use, and those that came early, by number."""
+
+    link: Link
+    current: Message | None = None
+    early: dict[int, Message] = field(default_factory=dict)
+    wanted: int = -1
+
+
+class Mailbox:
+    """All inputs of one role."""
+
+    def __init__(self, role: Role, plan: Plan) -> None:
+        members = plan.members
+        receiver = members[role.index].name
+        self._slots = {
+            (link.channel, link.source): _Slot(Link(link, plan.seed, members[link.source].name, receiver))
+            for link in plan.links_into(role.index)
+        }
+        self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
+        self.unexpected = 0
+        """Messages that no link of this role accounts for."""
+
+    def _slot(self, slot_input: Input) -> _Slot:
+        return self._slots[slot_input.channel, slot_input.source]
+
+    def deliver(self, message: Message) -> None:
+        """Takes a message, in whatever order it comes."""
+        slot = self._slots.get((message.channel, message.source))
+        if slot is None:
+            self.unexpected += 1
+        elif message.sequence >= slot.wanted:
+            slot.early[message.sequence] = message
+
+    def missing(self, stage: int, time_ns: int) -> list[Link]:
+        """Returns the links whose message in use at `time_ns` has not come; empty if the stage can run."""
+        waiting = []
+        for slot in self._stage_slots[stage]:
+            slot.wanted = number = slot.link.newest(time_ns)
+            if number >= 0 and number not in slot.early and (slot.current is None or slot.current.sequence != number):
+                waiting.append(slot.link)
+        return waiting
+
+    def take(self, stage: int, time_ns: int) -> list[Heard]:
+        """Returns what the stage hears at `time_ns`; to be called when nothing is `missing` for that instant."""
+        heard: list[Heard] = []
+        for slot in self._stage_slots[stage]:
+            number = slot.wanted
+            current = slot.current
+            if number >= 0 and (current is None or current.sequence != number):
+                slot.current = current = slot.early.pop(number)
+                if slot.early and not slot.link.plan.ideal:
+                    for old in [sequence for sequence in slot.early if sequence < number]:
+                        del slot.early[old]
+            if current is None or not current.values.size:
+                heard.append(None)
+            else:
+                slot.link.note_use(time_ns, number, current.time_ns)
+                heard.append(current)
+        return heard
+
+    def counts(self) -> list[LinkCounts]:
+        """Returns the counts of every link into this role."""
+        return [slot.link.counts() for slot in self._slots.values()]

@@ -1,0 +1,204 @@
+"""The plan: a scenario as the roles need it, with every default filled in, every wildcard resolved and every instant an
+integer of nanoseconds.  Plain frozen data: it is made once (`echelon.planning`) and handed to every process.
+
+Members are numbered: robots first, in the order of the tree, then nodes, children before parents; the root is last.
+Blocks of the transformed state (theory.md section 2) stand in the order of their nodes, then the centroid.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echelon.messages import Channel
+
+Array = NDArray[np.float64]
+COORDINATOR = "coordinator"
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPlan:
+    """A robot: its place in the tree and its parameters (theory.md section 1), SI units."""
+
+    index: int
+    path: str
+    parent: int
+    child_number: int
+    model: str
+    mass: float
+    inertia: float
+    wheel_radius: float
+    arm: float
+    offset: float
+    start: tuple[float, float]
+    heading: float
+    torque_limit: float
+    torque_rate_limit: float
+    wheel_speed_limit: float
+    period_ns: int
+    torque_period_ns: int
+
+    @property
+    def name(self) -> str:
+        """What people call it: its path."""
+        return self.path
+
+
+@dataclass(frozen=True, slots=True)
+class ShapePlan:
+    """A node's desired shape: `points` are its children's positions, or the shape variables themselves [m]."""
+
+    kind: str
+    points: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NodePlan:
+    """A node of the tree (group leader, or coordinator if it has no parent)."""
+
+    index: int
+    path: str
+    parent: int | None
+    child_number: int
+    children: tuple[int, ...]
+    weights: tuple[int, ...]
+    first_robot: int
+    depth: int
+    period_ns: int
+    shape: ShapePlan
+
+    @property
+    def name(self) -> str:
+        """What people call it: its path, or `coordinator`."""
+        return self.path or COORDINATOR
+
+    @property
+    def robots(self) -> int:
+        """How many robots stand below it."""
+        return sum(self.weights)
+
+    @property
+    def role(self) -> str:
+        """`leader` or `coordinator`."""
+        return "coordinator" if self.parent is None else "leader"
+
+
+@dataclass(frozen=True, slots=True)
+class BlockPlan:
+    """A block of the transformed state: the shape of one node (its `node`), or the centroid (`node` None).
+
+    It takes `size` numbers (x and y of each variable) from `offset` on; `layer` is `intra`, `inter` or `centroid`.
+    `sigma` [s] is its time scale; `k1`, `k2` are the gains K_fb1, K_fb2 before division by σ² and σ, (size, size).
+    """
+
+    name: str
+    layer: str
+    node: int | None
+    offset: int
+    size: int
+    sigma: float
+    k1: Array
+    k2: Array
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryPlan:
+    """The desired trajectory of the centroid: a kind and its parameters (controller.trajectory)."""
+
+    kind: str
+    parameters: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class AvoidancePlan:
+    """Collision avoidance: radii r_a < R_s [m], cap of one pair's force [m/s²]; `enabled` False only watches r_a."""
+
+    enabled: bool
+    avoidance_radius: float
+    sensing_radius: float
+    force_limit: float
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPlan:
+    """A directed link, applied where it ends: delay between two bounds [ns], i.i.d. loss, policy for a missing input."""
+
+    source: int
+    receiver: int
+    channel: Channel
+    period_ns: int
+    delay_min_ns: int = 0
+    delay_max_ns: int = 0
+    loss: float = 0.0
+    policy: str = "hold"
+
+    @property
+    def ideal(self) -> bool:
+        """True if every message is usable in the tick it was sent in."""
+        return self.delay_max_ns == 0 and self.loss == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class CanPlan:
+    """The bus: where, how fast, how many newton metres a bit of torque is."""
+
+    enabled: bool
+    url: str
+    bitrate: int
+    torque_scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClaimPlan:
+    """What the run is expected to show: every block of `block` (a name or a layer) stays within `band` of its largest
+    error from `settled_by` [s] on."""
+
+    block: str
+    settled_by: float
+    band: float
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A whole run."""
+
+    name: str
+    seed: int
+    duration_ns: int
+    display_period_ns: int
+    robots: tuple[RobotPlan, ...]
+    nodes: tuple[NodePlan, ...]
+    blocks: tuple[BlockPlan, ...]
+    coupling: Array
+    """K̄ of all blocks, (2N, 2N), zero on the diagonal blocks."""
+    lead: float
+    """How far ahead the law looks, in periods of its node (controller.law)."""
+    trajectory: TrajectoryPlan
+    avoidance: AvoidancePlan
+    links: tuple[LinkPlan, ...]
+    can: CanPlan
+    claims: tuple[ClaimPlan, ...]
+
+    @property
+    def root(self) -> NodePlan:
+        """The coordinator's node."""
+        return self.nodes[-1]
+
+    @property
+    def coupled(self) -> bool:
+        """True if some block acts on another, so that error rates must travel."""
+        return bool(self.coupling.any())
+
+    @property
+    def members(self) -> tuple[RobotPlan | NodePlan, ...]:
+        """Robots and nodes by index."""
+        return (*self.robots, *self.nodes)
+
+    def links_into(self, receiver: int) -> tuple[LinkPlan, ...]:
+        """The links that end at a member."""
+        return tuple(link for link in self.links if link.receiver == receiver)
+
+    def block_of(self, node: int) -> BlockPlan:
+        """The shape block of a node."""
+        return next(block for block in self.blocks if block.node == node)

@@ -1,0 +1,45 @@
+"""What a role is: a plain object with stages, each a function of (time, what it heard) that returns messages.
+
+Who calls the stages is none of the role's business: the in-process engine, a lockstep over Zenoh, or a wall clock.
+A stage runs at every multiple of its period; stages of one instant run in the order of `Role.stages`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from echelon.messages import Channel, Heard, Message
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """One channel of one source."""
+
+    source: int
+    channel: Channel
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One step of a role: at multiples of `period_ns`, `run(time_ns, heard)` with one entry of `heard` per input.
+
+    `level` orders stages within one instant over all roles of a run: a stage's inputs come from lower levels.
+    """
+
+    name: str
+    level: int
+    period_ns: int
+    inputs: tuple[Input, ...]
+    run: Callable[[int, Sequence[Heard]], tuple[Message, ...]]
+
+
+class Role(Protocol):
+    """A robot, a leader or a coordinator."""
+
+    @property
+    def index(self) -> int:
+        """The member's index in the plan."""
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """Its stages, in the order in which they run at one instant."""

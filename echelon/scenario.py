@@ -1,0 +1,295 @@
+"""The scenario: what a user writes, as pydantic models.  Every key is known, every value has a range and SI units.
+
+A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
+then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.load`; the plan that roles work with is
+made in `echelon.planning`.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Limit = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Point = tuple[Finite, Finite]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+Matrix = list[list[Finite]]
+ChannelName = Literal["state", "group_state", "reference", "command", "*"]
+
+
+class Table(BaseModel):
+    """A TOML table: unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, str_strip_whitespace=False)
+
+
+class Periods(Table):
+    """How often things happen [s]."""
+
+    acceleration: Positive = 0.01
+    """Accelerations: every node and robot, unless a group sets a `period` of its own."""
+    torque: Positive = 0.01
+    """The torque loop inside the robot; divides `acceleration`."""
+
+
+class RobotTable(Table):
+    """A robot, or what all robots of a level have in common (theory.md section 1)."""
+
+    model: Literal["paper", "rigid_body"] | None = None
+    """Plant: the paper's equations, or a rigid body with its mass at the reference point."""
+    mass: Positive | None = None
+    """m1 [kg]"""
+    inertia: Positive | None = None
+    """I [kg m²]; I − m1 d² must be positive"""
+    wheel_radius: Positive | None = None
+    """r [m]"""
+    arm: Positive | None = None
+    """R, lever arm of a wheel about the robot's middle: half the track [m]"""
+    offset: Finite | None = None
+    """d, from the axle to the reference point [m]; not zero"""
+    start: Point | None = None
+    """Position of the reference point at the start [m]; the robot is at rest"""
+    heading: Finite | None = None
+    """θ at the start [rad]"""
+    torque_limit: Limit | None = None
+    """Largest torque of a wheel [N m]"""
+    torque_rate_limit: Limit | None = None
+    """Largest change of a wheel's torque [N m/s]"""
+    wheel_speed_limit: Limit | None = None
+    """Wheel speed beyond which the motor gives no torque in the direction of motion [rad/s]"""
+
+
+class Shape(Table):
+    """Desired shape of a node's children: a named one, their `points`, or the shape variables as `vectors` [m]."""
+
+    kind: Literal["triangle", "polygon", "line", "column", "wedge", "points", "vectors"]
+    side: Positive | None = None
+    spacing: Positive | None = None
+    angle: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    """Between the arms of a wedge [degrees]"""
+    rotation: Finite = 0.0
+    """Counter-clockwise [degrees]"""
+    points: list[Point] | None = None
+    vectors: list[Point] | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Shape":
+        needs = {"triangle": "side", "polygon": "side", "line": "spacing", "column": "spacing", "wedge": "spacing"}
+        needed = needs.get(self.kind, self.kind)
+        if getattr(self, needed) is None:
+            raise ValueError(f"kind = {self.kind!r} needs the key {needed!r}")
+        for other in ("side", "spacing", "points", "vectors"):
+            if other != needed and getattr(self, other) is not None:
+                raise ValueError(f"kind = {self.kind!r} takes {needed!r}, not {other!r}")
+        return self
+
+
+class Group(Table):
+    """A node of the tree: its children are robots, groups, or both; their order is that of the file."""
+
+    shape: Shape | None = None
+    """May be left out for a single child"""
+    robot: RobotTable = RobotTable()
+    """What its robots have in common"""
+    robots: dict[Name, RobotTable] = {}
+    groups: dict[Name, "Group"] = {}
+    period: Positive | None = None
+    """Period of this node's accelerations [s], if not `periods.acceleration`; a multiple of its children's"""
+
+    @model_validator(mode="after")
+    def _children(self) -> "Group":
+        if not self.robots and not self.groups:
+            raise ValueError("a group needs robots or groups")
+        if twice := sorted(self.robots.keys() & self.groups.keys()):
+            raise ValueError(f"{twice[0]!r} names a robot and a group")
+        if "coordinator" in self.robots or "coordinator" in self.groups:
+            raise ValueError("'coordinator' is the name of the root")
+        if len(self.robots) + len(self.groups) > 1 and self.shape is None:
+            raise ValueError("a group of several children needs a shape")
+        return self
+
+
+class Line(Table):
+    """z_cd = start + velocity t"""
+
+    kind: Literal["line"]
+    start: Point = (0.0, 0.0)
+    velocity: Point
+
+
+class Circle(Table):
+    """z_cd = centre + radius (cos, sin)(rate t + phase)"""
+
+    kind: Literal["circle"]
+    centre: Point = (0.0, 0.0)
+    radius: Positive
+    rate: Finite
+    """[rad/s]"""
+    phase: Finite = 0.0
+    """[rad]"""
+
+
+class Sine(Table):
+    """z_cd = start + (speed t, amplitude sin(rate t)); the paper's"""
+
+    kind: Literal["sine"]
+    start: Point = (0.0, 0.0)
+    speed: Finite
+    amplitude: Finite
+    rate: Finite
+
+
+class Waypoints(Table):
+    """From point to point in straight lines, at rest in each, with the smoothest timing (least jerk) in between."""
+
+    kind: Literal["waypoints"]
+    points: Annotated[list[Point], Field(min_length=2)]
+    times: Annotated[list[NonNegative], Field(min_length=2)]
+    """When to be at each point [s], ascending"""
+
+    @model_validator(mode="after")
+    def _times(self) -> "Waypoints":
+        if len(self.times) != len(self.points):
+            raise ValueError(f"{len(self.points)} points need as many times, not {len(self.times)}")
+        if any(late <= early for early, late in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("times must ascend")
+        return self
+
+
+Trajectory = Annotated[Line | Circle | Sine | Waypoints, Field(discriminator="kind")]
+
+
+class Gains(Table):
+    """Gains before division by the time scale: K_1 = k1/σ², K_2 = k2/σ; a number, or a full matrix of the block."""
+
+    block: str = "*"
+    """Which blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
+    k1: Positive | Matrix = 1.0
+    k2: Positive | Matrix = 1.0
+
+
+class Coupling(Table):
+    """Velocity coupling K̄ of one pair of blocks: a number for every entry, or the full matrix."""
+
+    block: str = "*"
+    onto: str = "*"
+    """The block whose error rate acts on `block`"""
+    value: Finite | Matrix
+
+
+class Law(Table):
+    """The control law (theory.md section 3)."""
+
+    time_scales: Literal["three", "multi"] = "three"
+    """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
+    epsilon: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
+    """ε1, ε2, …: each block's σ is a product of the first ones"""
+    gains: list[Gains] = []
+    """Later entries override earlier ones"""
+    coupling: list[Coupling] = []
+    """Later entries override earlier ones; none means no coupling"""
+    lead: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """How far ahead the law looks, in periods: 0 is the paper's law as it stands, 0.5 makes up for the hold"""
+
+
+class Avoidance(Table):
+    """Collision avoidance (theory.md section 4)."""
+
+    enabled: bool = False
+    """False: robots do not avoid each other, but distances below `avoidance_radius` are still violations"""
+    avoidance_radius: Positive = 0.25
+    """r_a [m]"""
+    sensing_radius: Positive = 1.0
+    """R_s [m]"""
+    force_limit: Positive = 1e4
+    """Cap of one pair's ∇f [m/s²], also inside r_a, where the potential is not defined"""
+
+    @model_validator(mode="after")
+    def _radii(self) -> "Avoidance":
+        if self.sensing_radius <= self.avoidance_radius:
+            raise ValueError(
+                f"sensing_radius {self.sensing_radius} must be larger than avoidance_radius {self.avoidance_radius}"
+            )
+        return self
+
+
+class Uniform(Table):
+    """Any delay between two bounds [s], equally likely."""
+
+    min: NonNegative
+    max: NonNegative
+
+    @model_validator(mode="after")
+    def _bounds(self) -> "Uniform":
+        if self.max < self.min:
+            raise ValueError(f"max {self.max} must not be less than min {self.min}")
+        return self
+
+
+class LinkRule(Table):
+    """What links are like.  `source` and `receiver` are paths in the tree or `coordinator`; `*` stands for one chunk of
+    a path, `**` for any.  The last rule that fits a link holds, and only that one."""
+
+    source: str = "**"
+    receiver: str = "**"
+    channel: ChannelName = "*"
+    delay: NonNegative | Uniform = 0.0
+    """[s]"""
+    loss: Fraction = 0.0
+    """Probability that a message is lost, independent of all others"""
+    policy: Literal["hold"] = "hold"
+    """What a receiver uses if nothing newer has come: the last that came"""
+
+
+class Can(Table):
+    """The CAN bus."""
+
+    enabled: bool = True
+    url: str = "auto"
+    """`socketcan:vcan0`, `udp_multicast:…`, `virtual`; `auto` takes vcan0 where it is up, else udp_multicast"""
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    """[bit/s], for the bus load"""
+    torque_scale: Positive = 0.001
+    """Newton metres per bit of the torque frame; ±32767 bits fit"""
+
+
+class Record(Table):
+    """The recording."""
+
+    display_period: Positive = 0.02
+    """Between transforms, markers, odometry and joint states [s of run time]; states themselves are all recorded"""
+
+
+class Claim(Table):
+    """What the run is expected to show; the verdict fails if it does not."""
+
+    block: str
+    settled_by: Positive
+    """[s]"""
+    band: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    """Settled means: stays within this fraction of the block's largest error"""
+
+
+class Scenario(Table):
+    """A whole scenario."""
+
+    name: Name
+    description: str = ""
+    duration: Positive
+    """[s of run time]"""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    periods: Periods = Periods()
+    robot: RobotTable = RobotTable()
+    """What all robots have in common"""
+    formation: Group
+    """The root of the tree"""
+    trajectory: Trajectory
+    law: Law = Law()
+    avoidance: Avoidance = Avoidance()
+    links: list[LinkRule] = []
+    can: Can = Can()
+    record: Record = Record()
+    claims: list[Claim] = []

@@ -1,0 +1,1 @@
+"""Assembles whole runs: the in-process engine, processes under supervision, recording, summary, report, export."""

@@ -1,0 +1,81 @@
+"""The in-process engine: all roles of a plan in one process, messages handed over directly.  The truth of the others.
+
+Stages of one instant run in the order of their levels: robots say their states, nodes gather upwards, steer downwards,
+robots move.  What the roles hear goes through the same mailboxes, and so through the same links, as between processes.
+"""
+
+from collections.abc import Callable, Iterator
+from itertools import groupby
+from math import gcd
+
+from agents.robot import Robot
+from controller.node import TreeNode
+from echelon.link import LinkCounts
+from echelon.mailbox import Mailbox
+from echelon.messages import Message
+from echelon.plan import Plan
+from echelon.role import Role
+
+Sink = Callable[[Message], None]
+
+
+def make_roles(plan: Plan) -> list[Role]:
+    """Returns the roles of a plan by index: robots, then nodes."""
+    return [make_role(plan, index) for index in range(len(plan.members))]
+
+
+def make_role(plan: Plan, index: int) -> Role:
+    """Returns the role of one member."""
+    return Robot(plan, index) if index < len(plan.robots) else TreeNode(plan, index)
+
+
+class Engine:
+    """A run in one process."""
+
+    def __init__(self, plan: Plan, sink: Sink | None = None) -> None:
+        self.plan = plan
+        self.roles = make_roles(plan)
+        self.mailboxes = [Mailbox(role, plan) for role in self.roles]
+        self.messages = 0
+        self._sink = sink
+        receivers: dict[tuple[int, int], list[Mailbox]] = {}
+        for link in plan.links:
+            receivers.setdefault((link.source, link.channel), []).append(self.mailboxes[link.receiver])
+        self._receivers = receivers
+        stages = [
+            (stage.level, stage.period_ns, role.index, number, stage.run, self.mailboxes[role.index])
+            for role in self.roles
+            for number, stage in enumerate(role.stages)
+        ]
+        self._stages = [
+            (period, [(number, run, mailbox) for _, _, _, number, run, mailbox in group])
+            for (_, period), group in groupby(sorted(stages, key=lambda stage: stage[:4]), key=lambda stage: stage[:2])
+        ]
+        self._tick_ns = gcd(*[period for period, _ in self._stages])
+
+    def instants(self) -> Iterator[int]:
+        """Runs the whole plan, from 0 to its duration inclusive; yields each instant [ns] when it is done."""
+        receivers, sink, stages = self._receivers, self._sink, self._stages
+        for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
+            for period, group in stages:
+                if time_ns % period:
+                    continue
+                for number, run, mailbox in group:
+                    if mailbox.missing(number, time_ns):
+                        raise AssertionError(f"a stage at {time_ns} ns misses input: levels are wrong")
+                    for message in run(time_ns, mailbox.take(number, time_ns)):
+                        self.messages += 1
+                        for receiver in receivers.get((message.source, message.channel), ()):
+                            receiver.deliver(message)
+                        if sink is not None:
+                            sink(message)
+            yield time_ns
+
+    def run(self) -> None:
+        """Runs the whole plan."""
+        for _ in self.instants():
+            pass
+
+    def link_counts(self) -> list[LinkCounts]:
+        """Returns the counts of all links, receiver by receiver."""
+        return [counts for mailbox in self.mailboxes for counts in mailbox.counts()]

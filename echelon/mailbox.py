@@ -58,22 +58,35 @@ class Mailbox:
         return waiting
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
-        """Returns what the stage hears at `time_ns`; to be called when nothing is `missing` for that instant."""
+        """Returns what the stage hears at `time_ns`, which `missing` was asked for last.
+
+        In a lockstep nothing is missing by then.  On a wall clock something may be: then the newest that has come is
+        used instead, as the link's policy has it.
+        """
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
-            number = slot.wanted
+            number, early = slot.wanted, slot.early
+            if early:
+                message = early.pop(number, None)
+                if message is not None:
+                    slot.current = message
+                if early:
+                    self._catch_up(slot, number)
             current = slot.current
-            if number >= 0 and (current is None or current.sequence != number):
-                slot.current = current = slot.early.pop(number)
-                if slot.early and not slot.link.plan.ideal:
-                    for old in [sequence for sequence in slot.early if sequence < number]:
-                        del slot.early[old]
             if current is None or not current.values.size:
                 heard.append(None)
             else:
-                slot.link.note_use(time_ns, number, current.time_ns)
+                slot.link.note_use(time_ns, current.sequence, current.time_ns)
                 heard.append(current)
         return heard
+
+    @staticmethod
+    def _catch_up(slot: _Slot, number: int) -> None:
+        """Takes the newest of the messages up to `number`, and forgets the older ones: no stage will want them."""
+        for sequence in [sequence for sequence in slot.early if sequence <= number]:
+            message = slot.early.pop(sequence)
+            if (slot.current is None or sequence > slot.current.sequence) and slot.link.fate(sequence) is not None:
+                slot.current = message
 
     def counts(self) -> list[LinkCounts]:
         """Returns the counts of every link into this role."""

@@ -32,6 +32,8 @@ class Channel(IntEnum):
     then the avoidance force (x, y) on every robot below (where robots avoid each other)."""
     COMMAND = 4
     """Group leader to its robots: an acceleration (x, y) per child."""
+    FRAMES = 5
+    """Bridge to those who watch: per CAN frame two values whose bits are its identifier and its eight data bytes."""
 
 
 STATE_FIELDS: Final = (

@@ -1,6 +1,7 @@
 """What a run was, as arrays: the robots' states over time, gathered in memory or read back from a recording."""
 
 import hashlib
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,24 +54,31 @@ class Digest:
 
 
 class TraceBuilder:
-    """Gathers state messages into a Trace."""
+    """Gathers state messages into a Trace; keeps the bytes of the values, not the messages."""
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._times: list[list[int]] = [[] for _ in plan.robots]
-        self._states: list[list[NDArray[np.float64]]] = [[] for _ in plan.robots]
+        self._times = [array("q") for _ in plan.robots]
+        self._states = [bytearray() for _ in plan.robots]
 
     def add(self, message: Message) -> None:
         """Takes any message; only robots' states are kept."""
         if message.channel is Channel.STATE:
             self._times[message.source].append(message.time_ns)
-            self._states[message.source].append(message.values)
+            self._states[message.source] += message.values.tobytes()
+
+    def last(self) -> tuple[int, NDArray[np.float64]] | None:
+        """Returns the latest instant [ns] that all robots have reached and their last states, (robots, fields)."""
+        if not all(self._times):
+            return None
+        width = 8 * len(STATE_FIELDS)
+        rows = [np.frombuffer(bytes(states[-width:])) for states in self._states]
+        return min(times[-1] for times in self._times), np.array(rows)
 
     def build(self) -> Trace:
         """Returns the trace of what was added."""
         return Trace(
             self.plan,
             tuple(np.array(times, dtype=np.int64) for times in self._times),
-            tuple(np.array(states, dtype=float).reshape(-1, len(STATE_FIELDS)) for states in self._states),
+            tuple(np.frombuffer(bytes(states)).reshape(-1, len(STATE_FIELDS)) for states in self._states),
         )
-

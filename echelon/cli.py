@@ -1,0 +1,116 @@
+"""The command line.  Only the parser is here: each command's work is in the module that the table below names, and is
+imported when the command is called, so that `--help` is there at once."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+from echelon import __version__
+
+COMMANDS: Final = "sim.commands"
+"""The module with one function per command."""
+
+EPILOG: Final = """\
+a first look:
+  echelon run paper                     the paper's nine robots, thirteen processes over Zenoh; a report to look at
+  echelon run lab --clock wall          nine robots that could be built, in real time, torques on the CAN bus
+  echelon run paper --set avoidance.enabled=true --out runs/avoiding
+  echelon validate my.toml              what is wrong with a scenario, in one line
+
+exit codes: 0 done and the verdict holds, 1 the verdict fails, 2 the input is wrong, 3 the run could not finish
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Returns the parser of all commands."""
+    top = argparse.ArgumentParser(
+        prog="echelon",
+        description="Groups of wheeled robots in formation: every robot its own process, wheel torques on a CAN bus.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--version", action="version", version=f"echelon {__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, text: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".")
+
+    def scenario(command: argparse.ArgumentParser) -> None:
+        command.add_argument("scenario", help="a TOML file, or the name of a shipped scenario (paper, lab, …)")
+        command.add_argument(
+            "--set", action="append", metavar="KEY=VALUE", help="override a value, e.g. law.epsilon=[0.1,0.2]; repeatable"
+        )
+
+    run = add("run", "run a scenario; leaves a folder with recording, summary and report")
+    scenario(run)
+    run.add_argument(
+        "--engine",
+        choices=["processes", "inprocess"],
+        default="processes",
+        help="every role its own process over Zenoh (default), or all roles in one process",
+    )
+    run.add_argument(
+        "--clock",
+        choices=["virtual", "wall"],
+        default="virtual",
+        help="virtual: as fast as messages come, bit for bit repeatable (default); wall: paced by real time",
+    )
+    run.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default: runs/<scenario>-<utc time>)")
+    run.add_argument(
+        "--can", metavar="URL", help="socketcan:vcan0, udp_multicast:<group>:<port>, virtual, auto, or none"
+    )
+    run.add_argument("--json", action="store_true", help="print the summary as JSON")
+    run.add_argument("--quiet", action="store_true", help="show no progress")
+    run.add_argument("--no-report", action="store_true", help="write no report.html")
+    run.add_argument(
+        "--stall-timeout",
+        type=float,
+        default=30.0,
+        metavar="S",
+        help="give a run up that stands still for so long (virtual time; default: 30)",
+    )
+
+    validate = add("validate", "check a scenario and say what it means")
+    scenario(validate)
+    validate.add_argument("--json", action="store_true", help="print the facts as JSON")
+
+    report = add("report", "write the report of a run, or a comparison of several")
+    report.add_argument("runs", nargs="+", metavar="RUN", help="a run's folder")
+    report.add_argument("--out", type=Path, metavar="FILE", help="where to write it (default: report.html)")
+
+    export = add("export", "write a run as CSV: robots.csv, blocks.csv, links.csv")
+    export.add_argument("run", metavar="RUN", help="a run's folder")
+    export.add_argument("--csv", type=Path, required=True, metavar="DIR", help="folder for the files")
+
+    recover = add("recover", "mend a recording that was cut off")
+    recover.add_argument("file", type=Path, help="an MCAP file")
+    recover.add_argument("--out", type=Path, metavar="FILE", help="where to write it (default: <file>-recovered.mcap)")
+
+    dbc = add("dbc", "print the DBC of a scenario's torque frames, for cantools, SavvyCAN and the like")
+    scenario(dbc)
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parsed = parser().parse_args(arguments)
+    commands = import_module(COMMANDS)
+    try:
+        return int(getattr(commands, parsed.command)(parsed))
+    except commands.UsageError as error:
+        print(f"echelon: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # a reader such as head that has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
+    except KeyboardInterrupt:
+        print("echelon: interrupted", file=sys.stderr)
+        return 3
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,225 @@
+"""What the commands of `echelon` do.  Each takes parsed arguments and returns the exit code.
+
+0: done, and the verdict holds; 1: the verdict fails; 2: the input is wrong; 3: the run could not finish.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from echelon.load import ScenarioError, load, parse
+from echelon.plan import Plan
+from echelon.scenario import Scenario
+
+SCENARIOS = Path(__file__).resolve().parent.parent / "deploy" / "scenarios"
+
+
+class UsageError(Exception):
+    """A mistake of the user's; the text is one line."""
+
+
+def scenario_of(arguments: argparse.Namespace) -> tuple[Scenario, Plan]:
+    """Loads the scenario that a command names: a file, or one of those shipped.  Raises UsageError."""
+    name = arguments.scenario
+    path = Path(name)
+    if not path.exists() and path.suffix == "" and "/" not in name:
+        shipped = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
+        if name not in shipped:
+            raise UsageError(f"{name}: no such file, and no shipped scenario; those are {', '.join(shipped)}")
+        path = SCENARIOS / f"{name}.toml"
+    try:
+        return load(path, getattr(arguments, "set", None) or ())
+    except ScenarioError as error:
+        raise UsageError(str(error)) from None
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """`echelon run`"""
+    if arguments.engine == "processes":
+        from sim.supervisor import warm_up
+
+        warm_up()
+    scenario, plan = scenario_of(arguments)
+    from sim.live import Display
+    from sim.run import execute, new_folder
+    from sim.summary import summary_text
+
+    can_url = arguments.can or plan.can.url
+    if arguments.can == "none" or not (plan.can.enabled or arguments.can):
+        can_url = ""
+    if can_url:
+        can_url = _checked_bus(can_url)
+    try:
+        folder = new_folder(scenario, arguments.out)
+    except OSError as error:
+        raise UsageError(f"--out {arguments.out}: {error.strerror}") from None
+    display = Display(plan, quiet=arguments.quiet)
+    if not arguments.quiet:
+        display.say(_heading(plan, arguments, folder, can_url))
+    try:
+        finished = execute(
+            scenario,
+            plan,
+            folder,
+            engine=arguments.engine,
+            clock=arguments.clock,
+            can_url=can_url,
+            display=display,
+            stall_timeout_s=arguments.stall_timeout,
+        )
+    finally:
+        display.close()
+    if not arguments.no_report:
+        _report([folder], folder / "report.html")
+    if arguments.json:
+        print(json.dumps(finished.summary, indent=2, allow_nan=False))
+    else:
+        print(summary_text(finished.summary))
+        print(f"  folder   {folder}")
+    if finished.failure:
+        print(f"echelon: {finished.failure}", file=sys.stderr)
+        return 3
+    return 0 if finished.summary["verdict"]["holds"] else 1
+
+
+def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_url: str) -> str:
+    robots, nodes = len(plan.robots), len(plan.nodes)
+    how = "in one process" if arguments.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
+    bus = f", frames on {can_url}" if can_url else ""
+    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{bus}; into {folder}"
+
+
+def _checked_bus(url: str) -> str:
+    from bridge.bus import resolve
+
+    try:
+        return resolve(url)
+    except ValueError as error:
+        raise UsageError(f"--can {url}: {error}") from None
+
+
+def validate(arguments: argparse.Namespace) -> int:
+    """`echelon validate`"""
+    from bridge.load import explain
+
+    scenario, plan = scenario_of(arguments)
+    rate = 1e9 / plan.robots[0].period_ns
+    facts: dict[str, Any] = {
+        "scenario": scenario.name,
+        "robots": len(plan.robots),
+        "groups": len(plan.nodes) - 1,
+        "duration": plan.duration_ns / 1e9,
+        "ticks": plan.duration_ns // plan.robots[0].period_ns,
+        "time_scales": {block.name: block.sigma for block in plan.blocks},
+        "can": explain(len(plan.robots), rate, plan.can.bitrate) if plan.can.enabled else "disabled",
+    }
+    if arguments.json:
+        print(json.dumps(facts, indent=2))
+    else:
+        print(f"{arguments.scenario}: valid")
+        print(f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks")
+        print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
+        print(f"  CAN  {facts['can']}")
+    return 0
+
+
+def _read_run(folder: Path) -> Any:
+    """Reads a run's folder for a report.  Raises UsageError."""
+    from bridge.native import NativeCodec
+    from sim.recording import read_trace
+    from sim.report import RunForReport
+
+    try:
+        toml = (folder / "scenario.toml").read_text(encoding="utf-8")
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        _, plan = parse(toml, str(folder / "scenario.toml"))
+        trace = read_trace(folder / "run.mcap", plan)
+    except OSError as error:
+        raise UsageError(f"{error.filename}: {error.strerror}") from None
+    except (ScenarioError, ValueError) as error:
+        raise UsageError(f"{folder}: {error}") from None
+    frames = _first_frames(folder / "can.log", plan, NativeCodec(plan.can.torque_scale))
+    return RunForReport(folder.name, trace, summary, toml, frames)
+
+
+def _first_frames(path: Path, plan: Plan, codec: Any, count: int = 18) -> tuple[dict[str, object], ...]:
+    """Returns the first frames of a run's can.log, decoded; none if there is no log."""
+    from bridge.canlog import read_frames
+    from bridge.native import Torque
+
+    rows = []
+    for time_s, identifier, data in read_frames(path, count):
+        torque = codec.decode(identifier, data)
+        if isinstance(torque, Torque):
+            rows.append(
+                {
+                    "t [s]": f"{time_s:.6f}",
+                    "frame": f"{identifier:03X}#{data.hex().upper()}",
+                    "robot": plan.robots[torque.robot].name if torque.robot < len(plan.robots) else "?",
+                    "τ right [N m]": f"{torque.tau_right:g}",
+                    "τ left [N m]": f"{torque.tau_left:g}",
+                    "counter": torque.counter,
+                }
+            )
+    return tuple(rows)
+
+
+def _report(folders: list[Path], path: Path) -> None:
+    from sim.report import write_report
+
+    write_report([_read_run(folder) for folder in folders], path)
+
+
+def report(arguments: argparse.Namespace) -> int:
+    """`echelon report`"""
+    folders = [Path(run) for run in arguments.runs]
+    path = arguments.out or (folders[0] / "report.html" if len(folders) == 1 else Path("report.html"))
+    try:
+        _report(folders, path)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    print(path)
+    return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """`echelon export`"""
+    from sim.export import export_csv
+    from sim.recording import read_links
+
+    folder = Path(arguments.run)
+    run_read = _read_run(folder)
+    try:
+        arguments.csv.mkdir(parents=True, exist_ok=True)
+        export_csv(run_read.trace, [counts for _, counts in read_links(folder / "run.mcap")], arguments.csv)
+    except OSError as error:
+        raise UsageError(f"--csv {arguments.csv}: {error.strerror}") from None
+    print(arguments.csv)
+    return 0
+
+
+def recover(arguments: argparse.Namespace) -> int:
+    """`echelon recover`"""
+    from sim.recording import recover as mend
+
+    target = arguments.out or arguments.file.with_name(arguments.file.stem + "-recovered.mcap")
+    try:
+        result = mend(arguments.file, target)
+    except OSError as error:
+        raise UsageError(f"{error.filename or arguments.file}: {error.strerror}") from None
+    except ValueError as error:
+        raise UsageError(f"{arguments.file}: {error}") from None
+    print(f"{target}: {result.messages} messages, up to t = {result.end_ns / 1e9:g} s")
+    return 0
+
+
+def dbc(arguments: argparse.Namespace) -> int:
+    """`echelon dbc`"""
+    from bridge.dbc import torque_dbc
+
+    _, plan = scenario_of(arguments)
+    robots = [robot.path for robot in plan.robots]
+    sys.stdout.write(torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns))
+    return 0

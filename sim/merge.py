@@ -1,0 +1,60 @@
+"""Puts the messages of many sources into one order of time, whatever the order in which their batches come."""
+
+from echelon.messages import Message
+
+
+class TimeOrder:
+    """Messages by (time, source, channel), released once every source has gone past their time.
+
+    Each source sends in order of time, up to its `ends` [ns].  What is released is the same for the same messages,
+    however they came.
+    """
+
+    def __init__(self, ends: dict[int, int]) -> None:
+        self._ends = ends
+        self._latest = dict.fromkeys(ends, -1)
+        self._waiting: dict[int, list[Message]] = {}
+        self._released_ns = -1
+        self.pushed = 0
+        """Messages taken."""
+        self.refused = 0
+        """Messages of unknown sources, or older than what was released."""
+
+    def push(self, messages: list[Message]) -> list[Message]:
+        """Takes messages, in each source's order; returns those that can go now, in order."""
+        waiting, latest = self._waiting, self._latest
+        for message in messages:
+            time_ns = message.time_ns
+            if message.source not in latest or time_ns <= self._released_ns:
+                self.refused += 1
+                continue
+            self.pushed += 1
+            if time_ns > latest[message.source]:
+                latest[message.source] = time_ns
+            bucket = waiting.get(time_ns)
+            if bucket is None:
+                waiting[time_ns] = [message]
+            else:
+                bucket.append(message)
+        # A source at its end sends nothing after it: it holds nobody up.
+        behind = [time_ns for source, time_ns in latest.items() if time_ns < self._ends[source]]
+        return self._release(min(behind) if behind else max(latest.values()))
+
+    def rest(self) -> list[Message]:
+        """Returns what is left, in order: for the end of a run."""
+        return self._release(1 << 63)
+
+    @property
+    def complete(self) -> bool:
+        """True if every source has sent its last message."""
+        return all(latest >= self._ends[source] for source, latest in self._latest.items())
+
+    def _release(self, safe_ns: int) -> list[Message]:
+        """Releases everything before `safe_ns`."""
+        released: list[Message] = []
+        for time_ns in sorted(time_ns for time_ns in self._waiting if time_ns < safe_ns):
+            bucket = self._waiting.pop(time_ns)
+            bucket.sort(key=lambda message: (message.source, message.channel))
+            released.extend(bucket)
+            self._released_ns = time_ns
+        return released

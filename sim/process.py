@@ -1,0 +1,151 @@
+"""What runs in each process of a distributed run: a member, the recorder, or the bridge.
+
+A process is told everything in its `ProcessSpec`; it says `ready` when it is connected to all it will talk to, starts
+when it is told to, and says `done` with what it counted.  Its words on standard error go to the supervisor.
+"""
+
+import ctypes
+import os
+import resource
+import signal
+import sys
+import time
+import traceback
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final
+
+from agents.robot import Robot
+from controller.node import TreeNode
+from echelon.link import LinkCounts
+from echelon.plan import Plan
+from echelon.role import Role
+from echelon.runner import Runner, RunnerCounts
+from echelon.session import Session
+from echelon.wire import SCHEMA_VERSION, token_key
+
+READY_TIMEOUT_S: Final = 20.0
+_PR_SET_PDEATHSIG: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessSpec:
+    """Everything a process of a run needs to know."""
+
+    run: str
+    kind: str
+    """`robot`, `leader`, `coordinator`, `recorder` or `bridge`"""
+    name: str
+    index: int
+    plan: Plan
+    virtual: bool
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    peers: tuple[tuple[str, str], ...]
+    """(kind, name) of the processes whose tokens it waits for"""
+    watched: bool = True
+    folder: str = ""
+    can_url: str = ""
+    scenario_toml: str = ""
+    metadata: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a process leaves behind."""
+
+    name: str
+    cpu_s: float
+    resident_bytes: int
+    runner: RunnerCounts | None = None
+    links: tuple[LinkCounts, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+def make_role(plan: Plan, index: int) -> Role:
+    """Returns the role of one member: a robot, or a node of the tree."""
+    return Robot(plan, index) if index < len(plan.robots) else TreeNode(plan, index)
+
+
+def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
+    """Entry point of every process of a run."""
+    _die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal; the supervisor decides
+    os.dup2(words.fileno(), 1)
+    os.dup2(words.fileno(), 2)
+    words.close()
+    try:
+        if spec.kind == "recorder":
+            from sim.watchers import run_recorder as body
+        elif spec.kind == "bridge":
+            from sim.watchers import run_bridge as body
+        else:
+            body = _run_member
+        with Session(listen=spec.listen, connect=spec.connect, lockstep=spec.virtual) as session:
+            body(spec, session, control)
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)  # no atexit of the parent's, no wait for threads that may hang
+
+
+def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
+    """Shows that this process is ready, waits for its peers and for the start; returns the start instant [ns].
+
+    To be called when all subscribers are declared: the token stands for them.  Raises TimeoutError naming who is
+    missing, and who speaks another schema version.
+    """
+    tokens = session.watch_tokens(f"echelon/{spec.run}/@alive/**")
+    session.declare_token(token_key(spec.run, spec.kind, spec.name, f"{os.getpid()}-{time.monotonic_ns()}"))
+    wanted = {token_key(spec.run, kind, name, "*"): name for kind, name in spec.peers}
+    missing = tokens.wait(wanted, READY_TIMEOUT_S)
+    if missing:
+        others = {key.split("/")[3] for key in tokens.alive()} - {str(SCHEMA_VERSION)}
+        note = f"; some here speak schema version {', '.join(sorted(others))}, not {SCHEMA_VERSION}" if others else ""
+        raise TimeoutError(f"not there after {READY_TIMEOUT_S:g} s: {', '.join(wanted[key] for key in missing)}{note}")
+    control.send(("ready",))
+    _, start_ns = control.recv()
+    return int(start_ns)
+
+
+def resources() -> tuple[float, int]:
+    """Returns the CPU time [s] and the resident memory [bytes] of this process so far."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return usage.ru_utime + usage.ru_stime, pages * resource.getpagesize()
+
+
+def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    runner = Runner(
+        make_role(spec.plan, spec.index),
+        spec.plan,
+        session,
+        spec.run,
+        watched=spec.watched,
+        virtual=spec.virtual,
+    )
+    start_ns = meet(spec, session, control)
+    if spec.virtual:
+        _batch_scheduling()
+        runner.lockstep(lambda time_ns, sources: control.send(("waiting", time_ns, sources)))
+    else:
+        runner.wall_clock(start_ns)
+    cpu_s, resident = resources()
+    control.send(("done", Result(spec.name, cpu_s, resident, runner.counts, tuple(runner.mailbox.counts()))))
+    control.recv()  # until everyone is done: a link that closes early would look like a death to its neighbours
+
+
+def _die_with_parent() -> None:
+    """Ends this process with the one that made it, whatever becomes of the supervisor."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() == 1:
+        os._exit(1)
+
+
+def _batch_scheduling() -> None:
+    """Asks for long time slices without preemption by wake-ups: in a lockstep everyone waits for everyone anyway."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    except OSError:
+        pass

@@ -1,0 +1,474 @@
+"""Brings the processes of a run up, watches over them, and takes them down again.
+
+All processes come from one fork server that has imported what they need, so fifteen start in the time of one.  Nothing
+outlives the supervisor: processes die with the fork server, and that ends when the supervisor does, even by kill -9.
+The sockets between them lie in a private folder that is gone as soon as all are connected.
+"""
+
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from pathlib import Path
+from typing import Any, Final
+
+from echelon.link import LinkCounts
+from echelon.plan import Plan, RobotPlan
+from sim.process import ProcessSpec, Result, main
+from sim.trace import Trace, TraceBuilder
+
+PRELOAD: Final = ["sim.process"]
+START_TIMEOUT_S: Final = 30.0
+STALL_REPORT_S: Final = 3.0
+"""A run in virtual time that stands still for so long is reported, with the process everyone waits for."""
+GRACE_S: Final = 3.0
+"""How long watchers may take to close their files when a run breaks off, and processes to end."""
+WALL_START_S: Final = 0.1
+"""From the barrier to run time 0 on a wall clock."""
+LAST_WORDS: Final = 4000
+"""Bytes kept of what a process says on standard error."""
+
+
+@dataclass(slots=True)
+class Progress:
+    """How a run stands, for a live table; `states` are the robots' last ones, at `states_ns`."""
+
+    phase: str = "starting"
+    time_ns: int = 0
+    states_ns: int = 0
+    states: Any = None
+    messages: int = 0
+    started_s: float = 0.0
+    can: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    """Something to tell at once, e.g. whom everyone waits for"""
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a run left: the trace of what was recorded, counts, and `failure` if it did not finish."""
+
+    trace: Trace
+    links: list[LinkCounts]
+    results: list[Result]
+    can: dict[str, Any]
+    startup_s: float
+    wall_s: float
+    messages: int
+    failure: str | None = None
+
+
+@dataclass(slots=True)
+class _Child:
+    spec: ProcessSpec
+    process: ForkServerProcess
+    control: Connection
+    words: Connection
+    ready: bool = False
+    result: Result | None = None
+    waiting_for: list[int] = field(default_factory=list)
+    waiting_ns: int = -1
+    heard_s: float = 0.0
+    said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
+
+    @property
+    def name(self) -> str:
+        return self.spec.name
+
+    def last_words(self) -> str:
+        """Returns the end of what it said on standard error."""
+        return b"".join(self.said)[-LAST_WORDS:].decode(errors="replace").strip()
+
+
+class RunFailed(Exception):
+    """The run cannot go on; the text says why."""
+
+
+def warm_up() -> None:
+    """Starts the fork server, which imports in the background what processes need.  Call it early."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(PRELOAD)
+    from multiprocessing.forkserver import ensure_running
+
+    ensure_running()
+
+
+class Supervisor:
+    """One distributed run.  `show` is called about five times a second with the progress."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        *,
+        run: str,
+        virtual: bool,
+        can_url: str = "",
+        scenario_toml: str = "",
+        metadata: dict[str, str] | None = None,
+        recorded: bool = True,
+        show: Callable[[Progress], None] = lambda progress: None,
+        stall_timeout_s: float = 30.0,
+        order: Callable[[list[ProcessSpec]], list[ProcessSpec]] = lambda specs: specs,
+    ) -> None:
+        self.plan, self.virtual = plan, virtual
+        self.progress = Progress()
+        self._show = show
+        self._stall_timeout_s = stall_timeout_s
+        self._sockets = Path(tempfile.mkdtemp(prefix="echelon-", dir=_short_folder()))
+        self._specs = order(
+            _specs(plan, run, virtual, self._sockets, folder, can_url, scenario_toml, metadata or {}, recorded)
+        )
+        self._children: list[_Child] = []
+        self._moved_s = 0.0
+        self._moved_ns = -1
+        self._warned = False
+
+    def run(self) -> Outcome:
+        """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised."""
+        begun_s = time.monotonic()
+        failure: str | None = None
+        startup_s = wall_s = 0.0
+        previous = signal.signal(signal.SIGTERM, _interrupt)
+        try:
+            self._start()
+            self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
+            shutil.rmtree(self._sockets, ignore_errors=True)
+            startup_s = time.monotonic() - begun_s
+            start_s = time.monotonic() + (0.0 if self.virtual else WALL_START_S)
+            self._tell_all(("start", round(start_s * 1e9)))
+            self.progress.phase, self.progress.started_s = "running", start_s
+            self._moved_s = time.monotonic()
+            members = [child for child in self._children if child.spec.kind not in ("recorder", "bridge")]
+            limit_s = None if self.virtual else self.plan.duration_ns / 1e9 + 10.0
+            self._until(lambda: all(child.result for child in members), limit_s, "not done")
+            wall_s = time.monotonic() - start_s
+            self.progress.phase = "finishing"
+        except RunFailed as error:
+            failure = str(error)
+        except KeyboardInterrupt:
+            failure = "interrupted"
+        if failure is not None:
+            wall_s = max(0.0, time.monotonic() - self.progress.started_s) if self.progress.started_s else 0.0
+            self.progress.note = failure
+        try:
+            failure = self._finish_watchers(failure)
+        except KeyboardInterrupt:
+            failure = failure or "interrupted"
+        finally:
+            self._take_down()
+            shutil.rmtree(self._sockets, ignore_errors=True)
+            signal.signal(signal.SIGTERM, previous)
+        return self._outcome(failure, startup_s, wall_s)
+
+    def _start(self) -> None:
+        context: ForkServerContext = get_context("forkserver")
+        context.set_forkserver_preload(PRELOAD)
+        for spec in self._specs:
+            control, child_control = context.Pipe()
+            words, child_words = context.Pipe(duplex=False)
+            process = context.Process(target=main, args=(spec, child_control, child_words), name=spec.name, daemon=True)
+            process.start()
+            child_control.close()
+            child_words.close()
+            os.set_blocking(words.fileno(), False)
+            self._children.append(_Child(spec, process, control, words, heard_s=time.monotonic()))
+
+    def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
+        """Serves the children until `done`.  Raises RunFailed if one is lost, the run stalls, or the time is up."""
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        shown_s = 0.0
+        while not done():
+            self._serve(0.1)
+            self._check_lost()
+            now_s = time.monotonic()
+            if now_s - shown_s >= 0.2:
+                shown_s = now_s
+                self._check_stall(now_s)
+                self._show(self.progress)
+            if deadline_s is not None and now_s > deadline_s:
+                late = [child.name for child in self._children if not (child.ready if what == "not ready" else child.result)]
+                raise RunFailed(f"{what} after {timeout_s:g} s: {', '.join(late)}{self._words_of(late)}")
+
+    def _serve(self, timeout_s: float) -> None:
+        """Takes what children say on their control pipes and on standard error."""
+        by_handle: dict[Any, _Child] = {}
+        for child in self._children:
+            if not child.control.closed:
+                by_handle[child.control] = child
+            if not child.words.closed:
+                by_handle[child.words] = child
+        sentinels = [child.process.sentinel for child in self._children if child.result is None]
+        for handle in wait([*by_handle, *sentinels], timeout_s):
+            if isinstance(handle, Connection):
+                child = by_handle[handle]
+                if handle is child.words:
+                    self._hear_words(child)
+                else:
+                    self._hear(child)
+
+    def _hear_words(self, child: _Child) -> None:
+        try:
+            data = os.read(child.words.fileno(), 65536)
+        except BlockingIOError:
+            return
+        if data:
+            child.said.append(data)
+        else:
+            child.words.close()
+
+    def _hear(self, child: _Child) -> None:
+        try:
+            kind, *rest = child.control.recv()
+        except (EOFError, OSError):
+            child.control.close()
+            return
+        child.heard_s = time.monotonic()
+        progress = self.progress
+        match kind:
+            case "ready":
+                child.ready = True
+            case "waiting":
+                child.waiting_ns, child.waiting_for = rest
+            case "bus":
+                progress.can["url"] = rest[0]
+            case "progress" if child.spec.kind == "recorder":
+                news = rest[0]
+                progress.time_ns, progress.messages = news["time_ns"], news["messages"]
+                progress.states, progress.states_ns = news["states"], news["states_ns"]
+                if news["failure"] and progress.phase == "running":
+                    raise RunFailed(f"the recording failed: {news['failure']}")
+            case "progress":
+                progress.can.update(rest[0])
+            case "done":
+                child.result = rest[0]
+
+    def _check_lost(self) -> None:
+        for child in self._children:
+            if child.result is None and not child.process.is_alive():
+                while not child.control.closed and child.control.poll():
+                    self._hear(child)
+                if child.result is None:
+                    while not child.words.closed and wait([child.words], 0):
+                        before = len(child.said)
+                        self._hear_words(child)
+                        if len(child.said) == before:
+                            break
+                    raise RunFailed(f"lost {child.spec.kind} {child.name} ({_ending(child.process)}){self._words_of([child.name])}")
+
+    def _words_of(self, names: list[str]) -> str:
+        said = [
+            f"\n--- last words of {child.name}:\n{words}"
+            for child in self._children
+            if child.name in names and (words := child.last_words())
+        ]
+        return "".join(said)
+
+    def _check_stall(self, now_s: float) -> None:
+        """Raises or tells if the run, in virtual time, stands still."""
+        if self.progress.phase != "running" or not self.virtual:
+            return
+        at = (self.progress.time_ns, max((child.waiting_ns for child in self._children), default=-1))
+        if at != self._moved_ns:
+            self._moved_ns, self._moved_s = at, now_s  # type: ignore[assignment]
+            if self._warned:
+                self._warned, self.progress.note = False, "goes on"
+            return
+        still_s = now_s - self._moved_s
+        if still_s > STALL_REPORT_S and not self._warned:
+            self._warned = True
+            self.progress.note = f"stalled at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
+        if still_s > self._stall_timeout_s:
+            raise RunFailed(
+                f"stalled for {still_s:.0f} s at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
+            )
+
+    def _who_is_waited_for(self, now_s: float) -> str:
+        """Says which processes everyone waits for: those that themselves wait for nobody and say nothing."""
+        silent = [child for child in self._children if child.spec.kind in ("recorder", "bridge") and now_s - child.heard_s > 2]
+        if not silent:
+            silent = [
+                child
+                for child in self._children
+                if child.spec.kind not in ("recorder", "bridge")
+                and child.result is None
+                and now_s - child.heard_s > 2
+            ]
+        if silent:
+            return "everyone waits for " + ", ".join(
+                f"{child.name} (process {child.process.pid}, {_process_state(child.process.pid)})" for child in silent
+            )
+        members = self.plan.members
+        waits = [
+            f"{child.name} for {', '.join(members[source].name for source in child.waiting_for)}"
+            for child in self._children
+            if child.waiting_for
+        ]
+        return "all wait: " + "; ".join(waits)
+
+    def _finish_watchers(self, failure: str | None) -> str | None:
+        """Lets the bridge, then the recorder, finish their files; returns the failure, if there is one by now."""
+        links = [counts for child in self._children if child.result for counts in child.result.links]
+        sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0}
+        for child in self._children:
+            if child.result and child.result.runner:
+                sent[child.spec.kind] += child.result.runner.messages
+        for kind in ("bridge", "recorder"):
+            for child in self._children:
+                if child.spec.kind != kind or not child.ready or child.control.closed or not child.process.is_alive():
+                    continue
+                whole = failure is None and self.virtual  # on a wall clock, messages may be lost on the way
+                order = {
+                    "links": links,
+                    "robot_messages": sent["robot"] if whole else None,
+                    "expected": sum(sent.values()) if whole else None,
+                }
+                try:
+                    child.control.send(("finish", order))
+                    deadline_s = time.monotonic() + (GRACE_S if failure else 60.0)
+                    while child.result is None and child.process.is_alive() and time.monotonic() < deadline_s:
+                        self._serve(0.05)
+                except (RunFailed, OSError) as error:
+                    failure = failure or str(error)
+                if child.result is not None and kind == "bridge":
+                    sent["bridge"] = child.result.extra["messages"]
+                if child.result is None:
+                    failure = failure or f"lost {kind} ({_ending(child.process)}){self._words_of([child.name])}"
+        for child in self._children:
+            if child.spec.kind == "recorder" and child.result and child.result.extra["failure"]:
+                failure = failure or f"the recording failed: {child.result.extra['failure']}"
+        return failure
+
+    def _take_down(self) -> None:
+        """Ends all processes: those that are done by word, the others by signal."""
+        for child in self._children:
+            if child.result is not None and not child.control.closed:
+                try:
+                    child.control.send(("end",))
+                except OSError:
+                    pass
+            elif child.process.is_alive():
+                child.process.terminate()
+        deadline_s = time.monotonic() + GRACE_S
+        for child in self._children:
+            child.process.join(max(0.0, deadline_s - time.monotonic()))
+            if child.process.is_alive():
+                child.process.kill()
+                child.process.join()
+            child.control.close()
+            child.words.close()
+
+    def _outcome(self, failure: str | None, startup_s: float, wall_s: float) -> Outcome:
+        results = [child.result for child in self._children if child.result is not None]
+        extra: dict[str, dict[str, Any]] = {
+            child.spec.kind: child.result.extra for child in self._children if child.result is not None and child.result.extra
+        }
+        recorded = extra.get("recorder", {})
+        return Outcome(
+            trace=recorded.get("trace") or TraceBuilder(self.plan).build(),
+            links=[counts for result in results for counts in result.links],
+            results=results,
+            can=extra.get("bridge", {}),
+            startup_s=startup_s,
+            wall_s=wall_s,
+            messages=recorded.get("messages", 0),
+            failure=failure,
+        )
+
+    def _tell_all(self, message: tuple[Any, ...]) -> None:
+        for child in self._children:
+            child.control.send(message)
+
+
+def _specs(
+    plan: Plan,
+    run: str,
+    virtual: bool,
+    sockets: Path,
+    folder: Path,
+    can_url: str,
+    scenario_toml: str,
+    metadata: dict[str, str],
+    recorded: bool,
+) -> list[ProcessSpec]:
+    """Lists the processes of a run: every node listens, its children connect; all members connect to the watchers."""
+    endpoint = {node.index: f"unixsock-stream/{sockets}/{node.index}" for node in plan.nodes}
+    kind = {member.index: "robot" if isinstance(member, RobotPlan) else member.role for member in plan.members}
+    watchers = ([("recorder", "recorder")] if recorded else []) + ([("bridge", "bridge")] if can_url else [])
+    watcher_endpoint = {name: f"unixsock-stream/{sockets}/{name}" for _, name in watchers}
+    specs = []
+    for member in plan.members:
+        peers = [] if member.parent is None else [member.parent]
+        peers += [] if isinstance(member, RobotPlan) else member.children
+        specs.append(
+            ProcessSpec(
+                run=run,
+                kind=kind[member.index],
+                name=member.name,
+                index=member.index,
+                plan=plan,
+                virtual=virtual,
+                listen=(endpoint[member.index],) if member.index in endpoint else (),
+                connect=(
+                    *(() if member.parent is None else (endpoint[member.parent],)),
+                    *watcher_endpoint.values(),
+                ),
+                peers=(*((kind[peer], plan.members[peer].name) for peer in peers), *watchers),
+                watched=bool(watchers),
+            )
+        )
+    everyone = tuple((kind[member.index], member.name) for member in plan.members)
+    for watcher, name in watchers:
+        others = tuple(endpoint for other, endpoint in watcher_endpoint.items() if other != name)
+        specs.append(
+            ProcessSpec(
+                run=run,
+                kind=watcher,
+                name=name,
+                index=len(plan.members),
+                plan=plan,
+                virtual=virtual,
+                listen=(watcher_endpoint[name],),
+                connect=others if watcher == "bridge" else (),
+                peers=(*everyone, *(one for one in watchers if one[1] != name)),
+                folder=str(folder),
+                can_url=can_url,
+                scenario_toml=scenario_toml,
+                metadata=metadata,
+            )
+        )
+    # Those that import most start first.
+    return sorted(specs, key=lambda spec: spec.kind not in ("recorder", "bridge"))
+
+
+def _short_folder() -> str | None:
+    """Returns where sockets can lie: a path of theirs must not exceed 107 bytes."""
+    return None if len(tempfile.gettempdir()) < 60 else "/tmp"
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _ending(process: ForkServerProcess) -> str:
+    code = process.exitcode
+    if code is None:
+        return "does not answer"
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+def _process_state(pid: int | None) -> str:
+    """Returns what the kernel says of a process: running, sleeping, stopped…"""
+    try:
+        text = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return "gone"
+    state = next((line for line in text.splitlines() if line.startswith("State:")), "State: ? (unknown)")
+    return state.partition("(")[2].rstrip(")")

@@ -64,17 +64,25 @@ class TorqueLimits:
         Order: rate, magnitude, then wheel speed (v ± R ω)/r: beyond its limit a motor gives none in its direction.
         Torques that are no numbers become zero, and count as limited.
         """
-        right, limited_right = self._one(tau_right, self.tau_right, (v + self.arm * omega) / self.wheel_radius, h)
-        left, limited_left = self._one(tau_left, self.tau_left, (v - self.arm * omega) / self.wheel_radius, h)
-        self.tau_right, self.tau_left = right, left
-        return right, left, limited_right or limited_left
+        limit, change, speed = self.torque_limit, self.torque_rate_limit * h, self.wheel_speed_limit * self.wheel_radius
+        if not (
+            -limit <= tau_right <= limit
+            and -limit <= tau_left <= limit
+            and -change <= tau_right - self.tau_right <= change
+            and -change <= tau_left - self.tau_left <= change
+            and abs(v) + self.arm * abs(omega) <= speed
+        ):
+            wanted = tau_right, tau_left
+            tau_right = self._one(tau_right, self.tau_right, (v + self.arm * omega) / self.wheel_radius, change)
+            tau_left = self._one(tau_left, self.tau_left, (v - self.arm * omega) / self.wheel_radius, change)
+            self.tau_right, self.tau_left = tau_right, tau_left
+            return tau_right, tau_left, (tau_right, tau_left) != wanted
+        self.tau_right, self.tau_left = tau_right, tau_left
+        return tau_right, tau_left, False
 
-    def _one(self, wanted: float, last: float, wheel_speed: float, h: float) -> tuple[float, bool]:
+    def _one(self, wanted: float, last: float, wheel_speed: float, change: float) -> float:
         if wanted != wanted:
-            return 0.0, True
-        change = self.torque_rate_limit * h
+            return 0.0
         tau = min(max(wanted, last - change), last + change)
         tau = min(max(tau, -self.torque_limit), self.torque_limit)
-        if abs(wheel_speed) > self.wheel_speed_limit and tau * wheel_speed > 0:
-            tau = 0.0
-        return tau, tau != wanted
+        return 0.0 if abs(wheel_speed) > self.wheel_speed_limit and tau * wheel_speed > 0 else tau

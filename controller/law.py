@@ -74,8 +74,8 @@ class CentralLaw:
         e_dot = e_dot.ravel()
         nu = np.zeros_like(e)
         f_pot = None
-        if self.plan.avoidance.enabled:
-            f_pot = cbt.forward(self._forces(positions)).ravel()
+        if self.plan.avoidance.enabled and (forces := self._forces(positions)) is not None:
+            f_pot = cbt.forward(forces).ravel()
         for block, gains in zip(self.plan.blocks, self._gains, strict=True):
             rows = slice(block.offset, block.offset + block.size)
             nu[rows] = gains.nu(e[rows], e_dot[rows]) - gains.K_coupling @ e_dot

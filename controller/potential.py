@@ -31,28 +31,28 @@ class PairForces:
     """∇f of given pairs of robots; the pairs of a node are those whose robots stand under different children."""
 
     def __init__(self, first: NDArray[np.intp], second: NDArray[np.intp], robots: int, plan: AvoidancePlan) -> None:
-        self.first, self.second = first, second
         self._sensing_square = plan.sensing_radius**2
         self._avoidance_square = plan.avoidance_radius**2
         self._limit = plan.force_limit
-        self._incidence = np.zeros((robots, len(first)))
-        self._incidence[first, np.arange(len(first))] = 1.0
-        self._incidence[second, np.arange(len(first))] = -1.0
+        self._apart = np.zeros((len(first), robots))  # positions of robots to differences of pairs
+        self._apart[np.arange(len(first)), first] = 1.0
+        self._apart[np.arange(len(first)), second] = -1.0
 
-    def __call__(self, positions: Array) -> Array:
-        """Returns the force ∇f [m/s²] on every robot, (robots, 2), at `positions`, (robots, 2) [m]."""
-        apart = positions[self.first] - positions[self.second]
+    def __call__(self, positions: Array) -> Array | None:
+        """Returns the force ∇f [m/s²] on every robot, (robots, 2), at `positions`, (robots, 2) [m]; None if all are
+        beyond the sensing radius of each other."""
+        apart = self._apart @ positions
         q = np.einsum("ij,ij->i", apart, apart)
-        near = q < self._sensing_square
-        if not near.any():
-            return np.zeros_like(positions)
+        if not q.size or np.minimum.reduce(q) >= self._sensing_square:
+            return None
         gap = q - self._avoidance_square
         distance = np.sqrt(q)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             slope = 4 * distance * (self._sensing_square - q) * (self._sensing_square - self._avoidance_square) / gap**3
             push = np.where(gap > 0, np.minimum(slope, self._limit), self._limit)
             direction = np.where(distance[:, None] > 0, apart / distance[:, None], [1.0, 0.0])
-        return np.asarray(self._incidence @ (np.where(near, push, 0.0)[:, None] * direction))
+        push = np.where(q < self._sensing_square, push, 0.0)
+        return np.asarray(self._apart.T @ (push[:, None] * direction))
 
 
 def pairs_between(groups: list[range]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -103,8 +103,7 @@ class Link:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
         period = self.plan.period_ns
         if self._ideal:
-            self._newest = time_ns // period
-            return self._newest
+            return time_ns // period
         while self._sent * period <= time_ns:
             delay = self.fate(self._sent)
             if delay is None:
@@ -121,19 +120,19 @@ class Link:
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
         """Counts one use, at `time_ns`, of the message that was sent at `sent_ns`."""
         self._used += 1
-        if sequence == self._last:
-            self._held += 1
+        if sent_ns != time_ns:
+            age = time_ns - sent_ns
+            self._held += sequence == self._last
+            self._age_sum += age
+            if age > self._age_max:
+                self._age_max = age
         self._last = sequence
-        age = time_ns - sent_ns
-        self._age_sum += age
-        if age > self._age_max:
-            self._age_max = age
 
-    def counts(self) -> LinkCounts:
-        """Returns what became of the messages up to the last instant asked for."""
+    def counts(self, newest: int) -> LinkCounts:
+        """Returns what became of the messages up to the last instant asked for, when number `newest` was in use."""
         sent, delivered = self._sent, self._delivered
         if self._ideal:
-            sent = delivered = self._newest + 1
+            sent = delivered = newest + 1
         return LinkCounts(
             self.plan.source,
             self.plan.receiver,

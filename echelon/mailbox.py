@@ -18,6 +18,8 @@ class _Slot:
     """One input: its link, the message in use, and those that came early, by number."""
 
     link: Link
+    ideal: bool
+    period_ns: int
     current: Message | None = None
     early: dict[int, Message] = field(default_factory=dict)
     wanted: int = -1
@@ -30,7 +32,9 @@ class Mailbox:
         members = plan.members
         receiver = members[role.index].name
         self._slots = {
-            (link.channel, link.source): _Slot(Link(link, plan.seed, members[link.source].name, receiver))
+            (link.channel, link.source): _Slot(
+                Link(link, plan.seed, members[link.source].name, receiver), link.ideal, link.period_ns
+            )
             for link in plan.links_into(role.index)
         }
         self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
@@ -58,21 +62,22 @@ class Mailbox:
         return waiting
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
-        """Returns what the stage hears at `time_ns`, which `missing` was asked for last.
+        """Returns what the stage hears at `time_ns`.
 
         In a lockstep nothing is missing by then.  On a wall clock something may be: then the newest that has come is
         used instead, as the link's policy has it.
         """
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
-            number, early = slot.wanted, slot.early
+            early, current = slot.early, slot.current
+            number = slot.wanted = time_ns // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
             if early:
                 message = early.pop(number, None)
                 if message is not None:
-                    slot.current = message
+                    slot.current = current = message
                 if early:
                     self._catch_up(slot, number)
-            current = slot.current
+                    current = slot.current
             if current is None or not current.values.size:
                 heard.append(None)
             else:
@@ -90,4 +95,4 @@ class Mailbox:
 
     def counts(self) -> list[LinkCounts]:
         """Returns the counts of every link into this role."""
-        return [slot.link.counts() for slot in self._slots.values()]
+        return [slot.link.counts(slot.wanted) for slot in self._slots.values()]

@@ -6,9 +6,8 @@ needs).  It keeps a lockstep going, and whoever receives it is as if nothing had
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +52,11 @@ GROUP_FIELDS: Final = ("x", "y", "vx", "vy")
 """A group's centroid [m] and its velocity [m/s]."""
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message; `values` is float64, read-only when it was decoded."""
+class Message(NamedTuple):
+    """One message; `values` is float64, read-only when it was decoded.
+
+    A named tuple, for one is made for every message of every tick, in a third of the time of a frozen dataclass.
+    """
 
     channel: Channel
     source: int

@@ -92,10 +92,10 @@ def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_url: s
 
 
 def _checked_bus(url: str) -> str:
-    from bridge.bus import resolve
+    from bridge.bus import resolve_url
 
     try:
-        return resolve(url)
+        return resolve_url(url)
     except ValueError as error:
         raise UsageError(f"--can {url}: {error}") from None
 
@@ -150,16 +150,16 @@ def _first_frames(path: Path, plan: Plan, codec: Any, count: int = 18) -> tuple[
     from bridge.native import Torque
 
     rows = []
-    for time_s, identifier, data in read_frames(path, count):
+    for time_ns, identifier, data in read_frames(path, count):
         torque = codec.decode(identifier, data)
         if isinstance(torque, Torque):
             rows.append(
                 {
-                    "t [s]": f"{time_s:.6f}",
+                    "t [s]": f"{time_ns / 1e9:.6f}",
                     "frame": f"{identifier:03X}#{data.hex().upper()}",
                     "robot": plan.robots[torque.robot].name if torque.robot < len(plan.robots) else "?",
-                    "τ right [N m]": f"{torque.tau_right:g}",
-                    "τ left [N m]": f"{torque.tau_left:g}",
+                    "τ right [N m]": f"{torque.right:g}",
+                    "τ left [N m]": f"{torque.left:g}",
                     "counter": torque.counter,
                 }
             )

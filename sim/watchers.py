@@ -169,7 +169,7 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
         session.subscribe(keys, backpressure=True, high_water=HIGH_WATER),
         {robot.index: all_ends[robot.index] for robot in plan.robots},
     )
-    publisher = session.publisher(watch_key(spec.run, "@bridge"))
+    publisher = session.publisher(watch_key(spec.run, "bridge"))
     station = Station(plan, spec.can_url, Path(spec.folder))
     control.send(("bus", station.url))
     meet(spec, session, control)

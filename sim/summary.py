@@ -1,0 +1,170 @@
+"""What a run showed, in numbers: a dictionary for `summary.json`, and its plain-text rendering.
+
+Times are in seconds of run time.  JSON knows neither NaN nor infinity: a number that is not finite is null, and so is
+the settling time of a block that did not settle.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from echelon.link import LinkCounts
+from echelon.plan import Plan
+from sim.blocks import block_series
+from sim.distances import Distances, distances
+from sim.measures import block_row, claim_rows, distance_row, link_row, separation_rows, torque_row
+from sim.trace import Trace
+
+FORMAT: Final = 1
+
+
+def summarise(
+    trace: Trace, links: Sequence[LinkCounts], can: Mapping[str, Any], run: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Returns what a run showed; every value can be written as JSON.
+
+    `can` and `run` (wall time, real-time factor, engine, …) are taken over as they are, made fit for JSON.  Nothing is
+    raised for a run that diverged, broke off or never began: its verdict says so."""
+    plan = trace.plan
+    blocks = block_series(trace)
+    near = distances(trace)
+    end_ns = int(blocks.times_ns[-1]) if len(blocks.times_ns) else None
+    claims = claim_rows(plan, blocks)
+    reasons = [*_broken(trace, end_ns), *_failed(claims), *_too_close(plan, near)]
+    summary = {
+        "format": FORMAT,
+        "scenario": plan.name,
+        "seed": plan.seed,
+        "robots": len(plan.robots),
+        "duration": plan.duration_ns / 1e9,
+        "simulated": None if end_ns is None else end_ns / 1e9,
+        "instants": len(blocks.times_ns),
+        "largest_gap": float(np.diff(blocks.times_ns).max()) / 1e9 if len(blocks.times_ns) > 1 else None,
+        "verdict": {"holds": not reasons, "reasons": reasons},
+        "claims": claims,
+        "blocks": [block_row(series, blocks.times_ns) for series in blocks.series],
+        "separation": separation_rows(blocks),
+        "distance": distance_row(plan, near),
+        "torque": [torque_row(trace, robot) for robot in range(len(plan.robots))],
+        "links": [link_row(plan, counts) for counts in links],
+        "can": can,
+        "run": run,
+        "trace_digest": trace.digest(),
+    }
+    clean: dict[str, Any] = _json(summary)
+    return clean
+
+
+def write(summary: Mapping[str, Any], path: Path) -> None:
+    """Writes a summary as JSON.  Raises OSError; ValueError if a number in it is not finite."""
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def summary_text(summary: Mapping[str, Any]) -> str:
+    """Returns a summary as plain lines for a terminal."""
+    return "\n".join(_lines(summary))
+
+
+def _lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    verdict = summary["verdict"]
+    yield f"{summary['scenario']}: {'HOLDS' if verdict['holds'] else 'FAILS'}"
+    yield from (f"  because  {reason}" for reason in verdict["reasons"])
+    for claim in summary["claims"]:
+        what = f"{claim['block']} within {100 * claim['band']:g} % by {claim['settled_by']:g} s"
+        measured, word = number(claim["measured"], "s", "not settled"), "holds" if claim["holds"] else "fails"
+        yield f"  claim    {what}: {measured}, {word}"
+    for block in summary["blocks"]:
+        settled = "  ".join(f"{p} % {number(block[f'settling_{p}'], 's', 'never'):<9}" for p in (5, 2))
+        yield f"  block    {block['name']:<10} settled to {settled} residual {number(block['residual'], 'm')}"
+    for row in summary["separation"]:
+        ratio = f"{number(row['settling_5_ratio'])} times the settling (σ: {number(row['sigma_ratio'])})"
+        yield f"  scales   {row['slower']} over {row['faster']}: {ratio}"
+    distance = summary["distance"]
+    if distance["pair"]:
+        where = f"{' and '.join(distance['pair'])} at {number(distance['time'], 's')}"
+        yield f"  closest  {number(distance['smallest'], 'm')}, {where}; {len(distance['violations'])} violation(s)"
+    if torques := [row for row in summary["torque"] if row["peak"] is not None]:
+        most = max(torques, key=lambda row: float(row["peak"]))
+        share = max(float(row["saturation_share"] or 0.0) for row in torques)
+        peak = f"peak {number(most['peak'], 'N m')} ({most['robot']})"
+        yield f"  torque   {peak}, saturated at most {100 * share:.3g} % of the time"
+    sent, lost = (sum(link[key] for link in summary["links"]) for key in ("sent", "lost"))
+    age = max((link["age_max"] for link in summary["links"]), default=0.0)
+    yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
+    run = summary["run"]
+    if "wall_time" in run:
+        yield f"  wall     {number(run['wall_time'], 's')}, {number(run.get('real_time_factor'))} times real time"
+    yield f"  digest   {summary['trace_digest']}"
+
+
+def number(value: float | None, unit: str = "", missing: str = "–") -> str:
+    """Returns a number for people, four digits and its unit, or `missing`."""
+    if value is None:
+        return missing
+    return f"{value:.4g} {unit}".rstrip()
+
+
+def _broken(trace: Trace, end_ns: int | None) -> list[str]:
+    """Says what is not finite, and whether the run reached its end: the last instant that all robots share may be one
+    period of the coordinator before it."""
+    plan = trace.plan
+    reasons = []
+    for robot, states, times_ns in zip(plan.robots, trace.states, trace.times_ns, strict=True):
+        wrong = np.flatnonzero(~np.isfinite(states).all(axis=1))
+        if wrong.size:
+            reasons.append(f"{robot.name}: a state is not finite from {times_ns[wrong[0]] / 1e9:g} s on")
+    wanted = plan.duration_ns
+    needed = wanted - plan.root.period_ns
+    early = [
+        f"{robot.name} at {times_ns[-1] / 1e9:g} s" if len(times_ns) else f"{robot.name} before it began"
+        for robot, times_ns in zip(plan.robots, trace.times_ns, strict=True)
+        if not len(times_ns) or times_ns[-1] < needed
+    ]
+    if early:
+        who = "every robot ended early, the first" if len(early) == len(plan.robots) else "ended early:"
+        shown = early[:1] if len(early) == len(plan.robots) else early
+        reasons.append(f"{who} {', '.join(shown)} of {wanted / 1e9:g} s")
+    elif end_ns is None or end_ns < needed:
+        reasons.append(f"the robots have no instant in common at the end of {wanted / 1e9:g} s")
+    return reasons
+
+
+def _failed(claims: list[dict[str, Any]]) -> list[str]:
+    return [
+        f"claim: {claim['block']} within {claim['band']:.3g} of its largest error by {claim['settled_by']:g} s, but "
+        + ("it did not settle" if claim["measured"] is None else f"that took {claim['measured']:.6g} s")
+        for claim in claims
+        if not claim["holds"]
+    ]
+
+
+def _too_close(plan: Plan, near: Distances) -> list[str]:
+    if not plan.avoidance.enabled or not near.violations:
+        return []
+    worst = min(near.violations, key=lambda violation: violation.smallest)
+    one, other = (plan.robots[robot].name for robot in worst.pair)
+    return [
+        f"avoidance: {len(near.violations)} violation(s) of {plan.avoidance.avoidance_radius:g} m; {one} and {other} "
+        f"came to {worst.smallest:.4g} m after {worst.first_ns / 1e9:.6g} s"
+    ]
+
+
+def _json(value: Any) -> Any:
+    """Returns a value as JSON can hold it; numbers that are not finite become None."""
+    match value:
+        case Mapping():
+            return {str(key): _json(item) for key, item in value.items()}
+        case np.ndarray() | list() | tuple():
+            return [_json(item) for item in value]
+        case np.generic():
+            return _json(value.item())
+        case float():
+            return value if isfinite(value) else None
+        case None | bool() | int() | str():
+            return value
+        case _:
+            return str(value)

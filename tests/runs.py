@@ -1,0 +1,96 @@
+"""Runs for tests: small scenarios, and the command line as a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from echelon.load import load
+from echelon.plan import Plan
+from sim.engine import Engine
+from sim.trace import Trace, TraceBuilder
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENARIOS = ROOT / "deploy" / "scenarios"
+
+
+def plan_of(name: str, *overrides: str) -> Plan:
+    """Returns the plan of a shipped scenario with overrides."""
+    return load(SCENARIOS / f"{name}.toml", overrides)[1]
+
+
+def trace_of(plan: Plan) -> Trace:
+    """Returns the trace of a plan run in this process."""
+    builder = TraceBuilder(plan)
+    Engine(plan, builder.add).run()
+    return builder.build()
+
+
+def echelon(*arguments: str | Path, timeout: float = 120, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Runs the command line to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "echelon.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        cwd=options.pop("cwd", ROOT),
+        stdin=subprocess.DEVNULL,
+        **options,
+    )
+
+
+def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
+    """Starts the command line in a session of its own, so that all its processes can be found."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "echelon.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+    )
+
+
+def session_members(session: int) -> list[int]:
+    """Returns the processes of a session that are alive, zombies not counted."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[3]) == session and fields[0] != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+def until(condition: Any, timeout_s: float = 20.0) -> bool:
+    """Waits until a condition of other processes holds; False if it never does.  There is no event to wait for."""
+    import time
+
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """Reads a run's summary."""
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return summary
+
+
+def kill_session(session: int) -> None:
+    """Ends whatever a failed test left behind."""
+    for pid in session_members(session):
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass

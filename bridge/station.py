@@ -1,40 +1,47 @@
-"""The bridge at work: robots' states in, frames on the bus and in can.log out, and copies of them for the recorder."""
+"""The bridge at work: robots' states in; frames out, on the bus, in can.log, and as copies for the recorder."""
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from bridge.bridge import Bridge
-from bridge.bus import open_bus
+from bridge.bus import listen_command, open_bus
 from bridge.canlog import CanLog
 from bridge.dbc import torque_dbc
-from bridge.load import bus_load, worst_case_bits
-from echelon.messages import STATE_FIELDS, Channel, Message, field_index
+from bridge.load import bus_load, explain
+from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
-_TAU = field_index(STATE_FIELDS, "tau_right", "tau_left", "saturated")
+TAU_RIGHT: Final = STATE_FIELDS.index("tau_right")
+TAU_LEFT: Final = STATE_FIELDS.index("tau_left")
+SATURATED: Final = STATE_FIELDS.index("saturated")
+LOG_CHANNEL: Final = "can0"
+"""Name of the bus in can.log, whatever it was: logs of the same run are the same."""
 
 
 class Station:
-    """A bridge with its bus and its log.  `url` says where the frames can be heard."""
+    """A bridge with its bus, its log and its DBC.  `url` says in full where the frames can be heard.
+
+    Raises ValueError or OSError if the bus or the files cannot be had.
+    """
 
     def __init__(self, plan: Plan, url: str, folder: Path, epoch_ns: int = 0) -> None:
+        robots = [robot.path for robot in plan.robots]
         self._plan = plan
-        self._bridge = Bridge(
-            [robot.path for robot in plan.robots], plan.can.torque_scale, plan.robots[0].period_ns
-        )
+        self._bridge = Bridge(robots, plan.can.torque_scale, plan.robots[0].period_ns)
         self._bus = open_bus(url)
         self.url = self._bus.url
-        self._log = CanLog(folder / "can.log", self._bus.channel, epoch_ns)
-        self._index = len(plan.members)
-        self._messages = 0
-        self._last_ns = 0
-        (folder / "torque.dbc").write_text(torque_dbc(plan))
+        dbc = torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns)
+        (folder / "torque.dbc").write_text(dbc, encoding="utf-8")
+        self._log = CanLog(folder / "can.log", LOG_CHANNEL, epoch_ns)
+        self._source = len(plan.members)
+        self._sequence = 0
+        self._time_ns = 0
 
     def put(self, messages: list[Message]) -> list[Message]:
-        """Sends the torques of robots' states as frames; returns the frames as messages, one per instant.
+        """Sends the torques of robots' states, in order of time; returns the frames as messages, one per instant.
 
         The state at the start says nothing of torque: the first frame of a robot ends its first period.
         """
@@ -42,23 +49,68 @@ class Station:
         words: list[int] = []
         bus, log, encode = self._bus, self._log, self._bridge.encode
         wall_ns = time.monotonic_ns()
-        for message in messages:
-            if message.channel is not Channel.STATE or message.time_ns == 0:
+        for channel, source, _, time_ns, values in messages:
+            if channel is not Channel.STATE or time_ns == 0:
                 continue
-            if message.time_ns != self._last_ns:
+            if time_ns != self._time_ns:
                 self._copy(words, copies)
-                self._last_ns = message.time_ns
-            tau_right, tau_left, saturated = message.values[_TAU].tolist()
-            for identifier, data in encode(message.time_ns, message.source, tau_right, tau_left, saturated > 0):
-                bus.send(identifier, data, message.time_ns)
-                log.write(message.time_ns, identifier, data, wall_ns)
+                self._time_ns = time_ns
+            frames = encode(
+                time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
+            )
+            for identifier, data in frames:
+                bus.send(identifier, data, time_ns)
+                log.write(time_ns, identifier, data, wall_ns)
                 words += (identifier, int.from_bytes(data, "little"))
         self._copy(words, copies)
         return copies
 
+    def flush(self) -> None:
+        """Hands what is logged to the operating system."""
+        self._log.flush()
+
+    def close(self) -> None:
+        """Closes log and bus."""
+        self._log.close()
+        self._bus.close()
+
+    def progress(self) -> dict[str, Any]:
+        """Returns what a live table shows."""
+        return {"url": self.url, "load": self._load(), "frames": self._bridge.frames}
+
+    def result(self) -> dict[str, Any]:
+        """Returns the counts of bridge, bus and log, and the load this would be on a real bus, for the summary."""
+        bits = self._bridge.bits / self._bridge.frames if self._bridge.frames else 0.0
+        robots = self._bridge.summary()
+        rate = 1e9 / self._plan.robots[0].period_ns
+        return {
+            "url": self.url,
+            "listen": listen_command(self.url),
+            "bitrate": self._plan.can.bitrate,
+            "torque_scale": self._plan.can.torque_scale,
+            "frames": self._bridge.frames,
+            "clipped": sum(robot["clipped"] for robot in robots["robots"].values()),
+            "load_mean": self._load(),
+            "bits_per_frame": bits,
+            "fit": explain(len(self._plan.robots), rate, self._plan.can.bitrate, bits) if bits else "",
+            "sent": self._bus.counts.sent,
+            "failed": self._bus.counts.failed,
+            "dropped": self._bus.counts.dropped,
+            "log_lost": self._log.counts.lost,
+            "log_error": str(self._log.error) if self._log.error else None,
+            "robots": robots["robots"],
+            "messages": self._sequence,
+        }
+
+    def _load(self) -> float:
+        """Returns the share of a real bus that the frames so far take, in run time."""
+        if not self._time_ns:
+            return 0.0
+        return bus_load(self._bridge.frames * 1e9 / self._time_ns, self._plan.can.bitrate, self._bridge.bits / max(self._bridge.frames, 1))
+
     def _copy(self, words: list[int], copies: list[Message]) -> None:
         if words:
             values = np.array(words, dtype="<u8").view(np.float64)
-            copies.append(Message(Channel.FRAMES, self._index, self._messages, self._last_ns, values))
-            self._messages += 1
+            copies.append(Message(Channel.FRAMES, self._source, self._sequence, self._time_ns, values))
+            self._sequence += 1
             words.clear()

@@ -98,10 +98,10 @@ class Runner:
                     payloads = inbox.take(len(missing), STALL_S)
                     self._deliver(payloads)
                     if not payloads:
-                        self._flush()
+                        self.flush()
                         on_wait(time_ns, [link.plan.source for link in missing])
                 self._run_stage(number, stage, time_ns)
-        self._flush()
+        self.flush()
 
     def wall_clock(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
@@ -127,7 +127,7 @@ class Runner:
                 counts.stages += 1
                 counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns if stage.level else 0)
                 self._run_stage(number, stage, time_ns)
-            self._flush()
+            self.flush()
 
     def _run_stage(self, number: int, stage: Stage, time_ns: int) -> None:
         for message in stage.run(time_ns, self.mailbox.take(number, time_ns)):
@@ -149,7 +149,8 @@ class Runner:
                 continue
             self.mailbox.deliver(message)
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Sends what is held back for those who watch."""
         if self._watch is not None:
             self._watch.flush()
 

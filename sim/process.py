@@ -27,6 +27,8 @@ from echelon.wire import SCHEMA_VERSION, token_key
 
 READY_TIMEOUT_S: Final = 20.0
 _PR_SET_PDEATHSIG: Final = 1
+_PR_SET_NAME: Final = 15
+_libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,9 @@ def make_role(plan: Plan, index: int) -> Role:
 def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     """Entry point of every process of a run."""
     _die_with_parent()
+    _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # what ps, top and pgrep call it (15 characters)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal; the supervisor decides
+    signal.signal(signal.SIGTERM, _leave)
     os.dup2(words.fileno(), 1)
     os.dup2(words.fileno(), 2)
     words.close()
@@ -84,6 +88,8 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
             body = _run_member
         with Session(listen=spec.listen, connect=spec.connect, lockstep=spec.virtual) as session:
             body(spec, session, control)
+    except SystemExit:
+        os._exit(0)
     except BaseException:
         traceback.print_exc()
         sys.stderr.flush()
@@ -126,19 +132,27 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
         virtual=spec.virtual,
     )
     start_ns = meet(spec, session, control)
-    if spec.virtual:
-        _batch_scheduling()
-        runner.lockstep(lambda time_ns, sources: control.send(("waiting", time_ns, sources)))
-    else:
-        runner.wall_clock(start_ns)
+    try:
+        if spec.virtual:
+            _batch_scheduling()
+            runner.lockstep(lambda time_ns, sources: control.send(("waiting", time_ns, sources)))
+        else:
+            runner.wall_clock(start_ns)
+    finally:
+        runner.flush()  # what a run that breaks off has said so far is to be recorded
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, runner.counts, tuple(runner.mailbox.counts()))))
     control.recv()  # until everyone is done: a link that closes early would look like a death to its neighbours
 
 
+def _leave(number: int, frame: object) -> None:
+    """Ends this process in good order: what it holds back is sent, what it sent is delivered."""
+    raise SystemExit(0)
+
+
 def _die_with_parent() -> None:
     """Ends this process with the one that made it, whatever becomes of the supervisor."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() == 1:
         os._exit(1)
 

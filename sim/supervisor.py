@@ -157,8 +157,10 @@ class Supervisor:
             failure = "interrupted"
         if failure is not None:
             wall_s = max(0.0, time.monotonic() - self.progress.started_s) if self.progress.started_s else 0.0
-            self.progress.note = failure
+            self.progress.note = failure.splitlines()[0]
         try:
+            if failure is not None:
+                self._stop_members()
             failure = self._finish_watchers(failure)
         except KeyboardInterrupt:
             failure = failure or "interrupted"
@@ -312,6 +314,18 @@ class Supervisor:
             if child.waiting_for
         ]
         return "all wait: " + "; ".join(waits)
+
+    def _stop_members(self) -> None:
+        """Ends the members of a run that broke off: first asked, so that what they hold back is sent, then made to."""
+        members = [child for child in self._children if child.spec.kind not in ("recorder", "bridge")]
+        for child in members:
+            if child.process.is_alive():
+                child.process.terminate()
+        deadline_s = time.monotonic() + GRACE_S
+        for child in members:
+            child.process.join(max(0.0, deadline_s - time.monotonic()))
+            if child.process.is_alive():
+                child.process.kill()
 
     def _finish_watchers(self, failure: str | None) -> str | None:
         """Lets the bridge, then the recorder, finish their files; returns the failure, if there is one by now."""

@@ -1,0 +1,215 @@
+"""A run's processes come up together, give what one process gives, and go down together, however they end."""
+
+import os
+import resource
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from multiprocessing import Process
+from pathlib import Path
+from subprocess import Popen
+
+import pytest
+
+from echelon.plan import Plan
+from runs import kill_session, plan_of, session_members, start_echelon, summary_of, trace_of, until
+from sim.process import ProcessSpec
+from sim.recording import read_trace, recover
+from sim.supervisor import Outcome, Progress, Supervisor
+
+LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
+SHORT = "duration=0.3"
+
+
+def supervised(plan: Plan, folder: Path, **options: object) -> Outcome:
+    """Runs a plan as processes."""
+    return Supervisor(plan, folder, run=f"test-{os.getpid()}-{id(plan)}", virtual=True, **options).run()  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def long_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Path]]:
+    """A run that would take minutes, once it is recording; whatever is left of it is killed afterwards."""
+    folder = tmp_path / "run"
+    command = start_echelon("run", "paper", "--set", "duration=1000", "--can", "virtual", "--quiet", "--out", folder)
+    try:
+        recording = folder / "run.mcap"
+        assert until(lambda: recording.exists() and recording.stat().st_size > 200_000), command.communicate(timeout=5)
+        yield command, folder
+    finally:
+        kill_session(command.pid)
+        command.communicate()
+
+
+def pid_of(session: int, name: str) -> int:
+    """Returns the process of a run that bears a name."""
+    (pid,) = [pid for pid in session_members(session) if Path(f"/proc/{pid}/comm").read_text().strip() == name]
+    return pid
+
+
+def finished(command: Popen[str]) -> tuple[int, str, str]:
+    """Waits for the end of a run; all its processes must be gone by then, or in the moment after."""
+    out, err = command.communicate(timeout=30)
+    assert until(lambda: not session_members(command.pid), 5), session_members(command.pid)
+    return command.returncode, out, err
+
+
+@pytest.mark.parametrize("links", [(), (LINKS,)], ids=["ideal", "delay and loss"])
+def test_processes_give_the_trace_of_one_process(tmp_path: Path, links: tuple[str, ...]) -> None:
+    plan = plan_of("paper", SHORT, *links)
+    expected = trace_of(plan).digest()
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == expected
+    assert read_trace(tmp_path / "run.mcap", plan).digest() == expected
+
+
+def test_order_of_start_does_not_matter(tmp_path: Path) -> None:
+    plan = plan_of("paper", SHORT, LINKS)
+    outcome = supervised(plan, tmp_path, order=lambda specs: specs[::-1])
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def _spin() -> None:
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    while True:
+        pass
+
+
+def test_a_busy_core_does_not_matter(tmp_path: Path) -> None:
+    plan = plan_of("paper", SHORT, LINKS)
+    busy = Process(target=_spin, daemon=True)
+    busy.start()
+    try:
+        outcome = supervised(plan, tmp_path)
+    finally:
+        busy.kill()
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+@pytest.mark.parametrize("scenario", ["unequal", "three_levels", "multi"])
+def test_every_tree_gives_the_trace_of_one_process(tmp_path: Path, scenario: str) -> None:
+    plan = plan_of(scenario, "duration=0.4", "avoidance.enabled=true")
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def test_layers_with_periods_of_their_own(tmp_path: Path) -> None:
+    plan = plan_of("paper", SHORT, "formation.period=0.01", "formation.groups.g2.period=0.002", LINKS)
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def test_two_runs_at_once_never_meet(tmp_path: Path) -> None:
+    plans = [plan_of("paper", "duration=0.5", f"seed={seed}", LINKS) for seed in (1, 2)]
+    commands = [
+        start_echelon(
+            *("run", "paper", "--set", "duration=0.5", "--set", f"seed={seed}", "--set", LINKS),
+            *("--can", "none", "--no-report", "--quiet", "--out", tmp_path / str(seed)),
+        )
+        for seed in (1, 2)
+    ]
+    for command in commands:
+        finished(command)
+    digests = [summary_of(tmp_path / str(seed))["trace_digest"] for seed in (1, 2)]
+    assert digests == [trace_of(plan).digest() for plan in plans]
+    assert digests[0] != digests[1]
+
+
+def test_wall_clock_gives_the_same_when_nothing_is_late(tmp_path: Path) -> None:
+    plan = plan_of("lab", "duration=0.5", "periods.acceleration=0.05", "periods.torque=0.01")
+    outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
+    assert outcome.failure is None
+    runners = [result.runner for result in outcome.results if result.runner]
+    assert len(runners) == 13
+    if not sum(runner.late for runner in runners):
+        assert outcome.trace.digest() == trace_of(plan).digest()
+    assert outcome.wall_s >= 0.5
+
+
+def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:
+    command, folder = long_run
+    os.kill(pid_of(command.pid, "g2/r5"), signal.SIGKILL)
+    code, _, err = finished(command)
+    assert code == 3
+    assert "lost robot g2/r5 (killed by SIGKILL)" in err
+    summary = summary_of(folder)
+    assert not summary["verdict"]["holds"]
+    assert "g2/r5" in summary["verdict"]["reasons"][0]
+    assert len(read_trace(folder / "run.mcap", plan_of("paper", "duration=1000")).times_ns[0]) > 10
+
+
+def test_last_words_of_a_process_that_fails(tmp_path: Path) -> None:
+    def spoil(specs: list[ProcessSpec]) -> list[ProcessSpec]:
+        return [replace(spec, index=999) if spec.name == "g3" else spec for spec in specs]
+
+    outcome = supervised(plan_of("paper", SHORT), tmp_path, order=spoil)
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("lost leader g3 (exit code 1)")
+    assert "StopIteration" in outcome.failure
+
+
+def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None:
+    folder, notes = tmp_path, []
+    stopped: list[int] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns and not stopped:
+            stopped.extend(pid_of(os.getsid(0), "g2/r5") for _ in range(1))
+            os.kill(stopped[0], signal.SIGSTOP)
+        if progress.note and progress.note not in notes:
+            notes.append(progress.note)
+
+    outcome = supervised(plan_of("paper", "duration=1000"), folder, show=watch, stall_timeout_s=5.0)
+    assert any("everyone waits for g2/r5" in note and "stopped" in note for note in notes), notes
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("stalled")
+    assert not Path(f"/proc/{stopped[0]}").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_keeps_what_it_recorded(long_run: tuple[Popen[str], Path], number: int) -> None:
+    command, folder = long_run
+    os.kill(command.pid, number)
+    code, _, err = finished(command)
+    assert code == 3
+    assert "interrupted" in err
+    trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=1000"))
+    assert trace.digest() == summary_of(folder)["trace_digest"]
+
+
+def test_ctrl_c_in_a_terminal_reaches_everyone_and_ends_well(long_run: tuple[Popen[str], Path]) -> None:
+    command, folder = long_run
+    os.killpg(command.pid, signal.SIGINT)
+    code, _, err = finished(command)
+    assert code == 3
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert summary_of(folder)["instants"] > 10
+
+
+def test_nothing_outlives_a_killed_supervisor(long_run: tuple[Popen[str], Path], tmp_path: Path) -> None:
+    command, folder = long_run
+    assert len(session_members(command.pid)) >= 16
+    os.kill(command.pid, signal.SIGKILL)
+    command.wait()
+    assert until(lambda: not session_members(command.pid), 5), session_members(command.pid)
+    result = recover(folder / "run.mcap", tmp_path / "mended.mcap")
+    assert result.messages > 1000
+
+
+def test_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))  # inherited by all processes of the run
+    try:
+        command = start_echelon(
+            *("run", "paper", "--set", "duration=1000", "--can", "none", "--no-report", "--quiet"),
+            *("--out", tmp_path / "run"),
+        )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    code, _, err = finished(command)
+    assert code == 3
+    assert "the recording failed" in err
+    assert recover(tmp_path / "run" / "run.mcap", tmp_path / "mended.mcap").messages > 1000

@@ -10,7 +10,7 @@ from bridge.bridge import Bridge
 from bridge.bus import listen_command, open_bus
 from bridge.canlog import CanLog
 from bridge.dbc import torque_dbc
-from bridge.load import bus_load, explain
+from bridge.bus_load import bus_load, explain
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
@@ -30,10 +30,10 @@ class Station:
     def __init__(self, plan: Plan, url: str, folder: Path, epoch_ns: int = 0) -> None:
         robots = [robot.path for robot in plan.robots]
         self._plan = plan
-        self._bridge = Bridge(robots, plan.can.torque_scale, plan.robots[0].period_ns)
+        self._bridge = Bridge(robots, plan.can.torque_scale, [robot.period_ns for robot in plan.robots])
         self._bus = open_bus(url)
         self.url = self._bus.url
-        dbc = torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns)
+        dbc = torque_dbc(robots, plan.can.torque_scale, [robot.period_ns for robot in plan.robots])
         (folder / "torque.dbc").write_text(dbc, encoding="utf-8")
         self._log = CanLog(folder / "can.log", LOG_CHANNEL, epoch_ns)
         self._source = len(plan.members)

@@ -1,0 +1,145 @@
+"""The bridge: wheel torques in, CAN frames out, and what there is to know about them. Pure: no bus, no clock.
+
+Each robot sends its torques once per acceleration period, and each becomes one frame at once; nothing is held back, so
+torques in the order (time, robot) give frames in that order. What must not reach a wheel becomes a frame with zero
+torque that does not enable, so that the drives stop instead of holding the torque before.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from bridge.bus_load import many_frame_bits
+from bridge.native import MAX_ROBOTS, NativeCodec, frame_id
+
+_BLOCK = 1024
+
+Frame = tuple[int, bytes]
+"""CAN identifier (11 bits) and data (8 bytes)."""
+
+
+class Stop(StrEnum):
+    """Why a frame does not enable."""
+
+    NOT_FINITE = "not finite"
+    STALE = "stale"
+    MISSING = "missing"
+    REQUESTED = "requested"
+
+
+@dataclass(slots=True)
+class RobotCounts:
+    """What the bridge saw of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
+
+    frames: int = 0
+    stopped: dict[Stop, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
+    repeated: int = 0  # torques for a period that had its frame: no frame
+    skipped: int = 0  # periods without torques between two that had them
+    clipped: int = 0  # frames in which a torque was cut to the range of the frame
+    saturated: int = 0  # frames that say the robot's own limit was reached
+    smallest: tuple[float, float] = (math.inf, math.inf)
+    largest: tuple[float, float] = (-math.inf, -math.inf)
+    last_ns: int | None = None  # the newest torques turned into a frame
+
+
+class Bridge:
+    """Turns torques into native frames.
+
+    Parameters: the robots' path names in the order of their numbers, the torque scale [N m per bit], and the
+    acceleration period [ns]. Raises ValueError for more robots than identifiers, or a scale or period that is not
+    positive."""
+
+    __slots__ = ("_codec", "_counters", "_names", "_bits", "_period_ns", "_sent_data", "_sent_ids", "counts", "frames")
+
+    def __init__(self, robots: Sequence[str], torque_scale: float, period_ns: int | Sequence[int]) -> None:
+        if len(robots) > MAX_ROBOTS:
+            raise ValueError(f"a bus has identifiers for {MAX_ROBOTS} robots, not {len(robots)}")
+        periods = [period_ns] * len(robots) if isinstance(period_ns, int) else list(period_ns)
+        if len(periods) != len(robots) or min(periods, default=1) <= 0:
+            raise ValueError(f"periods must be positive, one for each of {len(robots)} robots, not {period_ns!r} ns")
+        self._codec = NativeCodec(torque_scale)
+        self._names = tuple(robots)
+        self._period_ns = periods
+        self._counters = [0] * len(robots)
+        self.counts = [RobotCounts() for _ in robots]
+        self.frames = 0
+        self._bits = 0
+        self._sent_ids: list[int] = []  # of frames whose bits are not counted yet: many at once is ten times cheaper
+        self._sent_data = bytearray()
+
+    def encode(
+        self, time_ns: int, robot: int, tau_right: float, tau_left: float, saturated: bool = False
+    ) -> list[Frame]:
+        """The frame for the torques [N m] that robot number `robot` commands at `time_ns`.
+
+        Torques not finite, or older than the last ones, give a frame that stops the robot's drives; a second set of
+        torques for one instant gives none. Raises IndexError for a robot the bridge does not have."""
+        counts = self.counts[robot]
+        last = counts.last_ns
+        if last is not None and time_ns <= last:
+            if time_ns < last:
+                return self.stop(robot, Stop.STALE)
+            counts.repeated += 1
+            return []
+        counts.last_ns = time_ns
+        if last is not None:
+            counts.skipped += max(0, (time_ns - last + self._period_ns[robot] // 2) // self._period_ns[robot] - 1)
+        if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
+            return self.stop(robot, Stop.NOT_FINITE)
+        (low_right, low_left), (high_right, high_left) = counts.smallest, counts.largest
+        if tau_right < low_right or tau_left < low_left:
+            counts.smallest = min(tau_right, low_right), min(tau_left, low_left)
+        if tau_right > high_right or tau_left > high_left:
+            counts.largest = max(tau_right, high_right), max(tau_left, high_left)
+        data, clipped = self._codec.encode(robot, tau_right, tau_left, self._counters[robot], saturated=saturated)
+        counts.clipped += clipped > 0
+        counts.saturated += saturated
+        return self._send(robot, data)
+
+    def stop(self, robot: int, why: Stop = Stop.REQUESTED) -> list[Frame]:
+        """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
+        counts = self.counts[robot]
+        counts.stopped[why] = counts.stopped.get(why, 0) + 1
+        data, _ = self._codec.encode(robot, 0.0, 0.0, self._counters[robot], enable=False)
+        return self._send(robot, data)
+
+    def _send(self, robot: int, data: bytes) -> list[Frame]:
+        can_id = frame_id(robot)
+        self._counters[robot] += 1
+        self.counts[robot].frames += 1
+        self.frames += 1
+        self._sent_ids.append(can_id)
+        self._sent_data += data
+        if len(self._sent_ids) >= _BLOCK:
+            self._count_bits()
+        return [(can_id, data)]
+
+    @property
+    def bits(self) -> int:
+        """Bits that all frames so far would take on a real bus, stuff bits and interframe space included."""
+        self._count_bits()
+        return self._bits
+
+    def _count_bits(self) -> None:
+        self._bits += int(many_frame_bits(self._sent_ids, bytes(self._sent_data)).sum())
+        self._sent_ids.clear()
+        self._sent_data.clear()
+
+    def summary(self) -> dict[str, Any]:
+        """All counts, ready for JSON: totals, and one entry for each robot under its path name."""
+        robots = {}
+        for name, counts in zip(self._names, self.counts, strict=True):
+            commanded = counts.smallest[0] <= counts.largest[0]
+            robots[name] = {
+                "frames": counts.frames,
+                "stopped": {why.value: number for why, number in sorted(counts.stopped.items())},
+                "repeated": counts.repeated,
+                "skipped": counts.skipped,
+                "clipped": counts.clipped,
+                "saturated": counts.saturated,
+                "torque_min": list(counts.smallest) if commanded else None,
+                "torque_max": list(counts.largest) if commanded else None,
+            }
+        return {"frames": self.frames, "bits": self.bits, "torque_limit": self._codec.limit, "robots": robots}

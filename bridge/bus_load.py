@@ -1,0 +1,136 @@
+"""How full a real CAN bus would be: exact lengths of classic CAN frames, and the load they make. Pure.
+
+A data frame with an 11-bit identifier and n data bytes is, in bits: start of frame 1, identifier 11, RTR, IDE and r0 1
+each, length code 4, data 8 n, CRC 15; then CRC delimiter, acknowledge slot and its delimiter 1 each, end of frame 7;
+then the 3 bits of interframe space. From the start to the end of the CRC the sender puts a bit of opposite value after
+five equal ones, and such stuff bits count as bits of the next run (ISO 11898-1).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+_TAIL = 13  # delimiters, acknowledge, end of frame and interframe space: never stuffed
+_POLYNOMIAL = 0x4599  # CRC-15: x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 7
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x8000 | _POLYNOMIAL if crc & 0x4000 else 0)
+        table.append(crc)
+    return tuple(table)
+
+
+def _stuff_bit(state: int, bit: int) -> tuple[int, int]:
+    """The next state and the stuff bits added (0 or 1) when `bit` is sent; a state is 8 * last bit + length of run."""
+    last, run = divmod(state, 8)
+    run = run + 1 if bit == last else 1
+    return ((1 - bit) * 8 + 1, 1) if run == 5 else (bit * 8 + run, 0)
+
+
+def _stuff_table() -> dict[int, tuple[tuple[int, int], ...]]:
+    """For each state between two bytes and each byte: the next state, and the stuff bits added."""
+    table = {}
+    for state in [last * 8 + run for last in (0, 1) for run in (1, 2, 3, 4)]:
+        row = []
+        for byte in range(256):
+            after, added = state, 0
+            for shift in range(7, -1, -1):
+                after, more = _stuff_bit(after, byte >> shift & 1)
+                added += more
+            row.append((after, added))
+        table[state] = tuple(row)
+    return table
+
+
+_CRC = _crc_table()
+_STUFF = _stuff_table()
+_CRC_ARRAY = np.array(_CRC)
+_AFTER, _ADDED = np.zeros((2, 16, 256), dtype=np.int64)
+for _state, _row in _STUFF.items():
+    _AFTER[_state], _ADDED[_state] = np.array(_row).T
+
+
+def _check_length(length: int) -> None:
+    if not 0 <= length <= 8:
+        raise ValueError(f"a classic CAN frame has 0 .. 8 bytes, not {length}")
+
+
+def frame_bits(can_id: int, data: bytes) -> int:
+    """Bits that this very frame takes on the bus: stuffing as it really happens, and 3 bits of interframe space.
+
+    Raises ValueError for an identifier of more than 11 bits or more than 8 bytes."""
+    if not 0 <= can_id < 0x800:
+        raise ValueError(f"identifier must have 11 bits, not {can_id:#x}")
+    _check_length(len(data))
+    # start of frame (0), identifier, RTR, IDE and r0 (0) and length code: 19 bits, here behind five zeros, which leave
+    # a CRC that starts with zero as it is
+    head = (can_id << 7 | len(data)).to_bytes(3, "big")
+    crc = 0
+    for byte in head + data:
+        crc = (crc << 8 & 0x7FFF) ^ _CRC[crc >> 7 ^ byte]
+    # all that is stuffed: 34 + 8 n bits, two of which come before the whole bytes
+    length = 34 + 8 * len(data)
+    bits = (can_id << 7 | len(data)) << (length - 19) | int.from_bytes(data, "big") << 15 | crc
+    # start of frame is 0, then comes the identifier's highest bit: a run of one 1, or of two 0
+    state = 8 + 1 if bits >> (length - 2) else 2
+    total = length + _TAIL
+    table = _STUFF
+    for byte in (bits & (1 << (length - 2)) - 1).to_bytes((length - 2) // 8, "big"):
+        state, added = table[state][byte]
+        total += added
+    return total
+
+
+def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
+    """`frame_bits` of many frames of eight bytes at once, (n,): `data` is all their bytes, 8 n, one after the other.
+
+    Raises ValueError for an identifier of more than 11 bits, or data of another length."""
+    identifiers = np.array(can_ids, dtype=np.int64)
+    if len(data) != 8 * len(identifiers) or (identifiers.size and not 0 <= identifiers.min() <= identifiers.max() < 0x800):
+        raise ValueError(f"{len(identifiers)} identifiers of 11 bits with 8 bytes each, not {len(data)} bytes in all")
+    octets = np.frombuffer(data, np.uint8).reshape(-1, 8).T.astype(np.int64)
+    head = identifiers << 7 | 8
+    crc = np.zeros_like(head)
+    for octet in (head >> 16, head >> 8 & 0xFF, head & 0xFF, *octets):
+        crc = (crc << 8 & 0x7FFF) ^ _CRC_ARRAY[crc >> 7 ^ octet]
+    # The 96 bits after the first two, as 12 bytes: 17 of the head, 64 of data, 15 of the CRC.
+    parts = (head >> 9 & 0xFF, head >> 1 & 0xFF, *(((before & 1) << 7 | octet >> 1) for before, octet in zip((head, *octets), (*octets, crc >> 7), strict=True)), crc & 0xFF)
+    state = np.where(head >> 17 & 1, 8 + 1, 2)
+    total = np.full_like(head, 34 + 64 + _TAIL)
+    for part in parts:
+        total += _ADDED[state, part]
+        state = _AFTER[state, part]
+    return total
+
+
+def worst_case_bits(length: int = 8) -> int:
+    """Bits of the longest frame with `length` data bytes: a stuff bit after the first five bits, then after every four.
+
+    Raises ValueError unless 0 <= length <= 8."""
+    _check_length(length)
+    stuffed = 34 + 8 * length
+    return stuffed + _TAIL + (stuffed - 1) // 4
+
+
+def bus_load(frames_per_second: float, bitrate: float, bits_per_frame: float = worst_case_bits(8)) -> float:
+    """The share of a bus of `bitrate` [bit/s] that the frames take: 1 is a full bus, more does not fit.
+
+    Raises ValueError unless the bit rate is positive."""
+    if not bitrate > 0:
+        raise ValueError(f"bit rate must be positive, not {bitrate!r}")
+    return frames_per_second * bits_per_frame / bitrate
+
+
+def explain(robots: int, rate: float, bitrate: float, bits_per_frame: float = worst_case_bits(8)) -> str:
+    """One line that says whether the frames of `robots` at `rate` [Hz] each fit a bus of `bitrate` [bit/s], and why."""
+    load = bus_load(robots * rate, bitrate, bits_per_frame)
+    verdict = "fits" if load <= 1 else "does not fit"
+    speed = f"{bitrate / 1e6:g} Mbit/s" if bitrate >= 1e6 else f"{bitrate / 1e3:g} kbit/s"
+    noun = "robot" if robots == 1 else "robots"
+    percent = f"{100 * load:.3g} %"
+    return f"{verdict} one {speed} bus: {robots} {noun} x {rate:g} Hz x {bits_per_frame:.0f} bit = {percent}"

@@ -1,0 +1,121 @@
+"""The bridge: one frame per robot and period, and never torque that nobody commanded."""
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.bridge import Bridge, Stop
+from bridge.bus_load import frame_bits
+from bridge.native import CounterCheck, NativeCodec, Torque
+
+MS = 1_000_000
+CODEC = NativeCodec(0.001)
+
+
+def make() -> Bridge:
+    return Bridge(["g1/r1", "g1/r2"], 0.001, 10 * MS)
+
+
+def decode(frames: list[tuple[int, bytes]]) -> Torque:
+    ((can_id, data),) = frames
+    frame = CODEC.decode(can_id, data)
+    assert isinstance(frame, Torque)
+    return frame
+
+
+def test_one_frame_per_robot_and_period_in_order() -> None:
+    bridge = make()
+    frames = [bridge.encode(step * 10 * MS, robot, 1.0 + robot, -0.5, False) for step in range(20) for robot in (0, 1)]
+    assert [decode(one) for one in frames] == [
+        Torque(robot, 1.0 + robot, -0.5, True, False, False, step % 16) for step in range(20) for robot in (0, 1)
+    ]
+    assert bridge.frames == 40
+    assert bridge.bits == sum(frame_bits(can_id, data) for ((can_id, data),) in frames)
+    assert [counts.skipped for counts in bridge.counts] == [0, 0]
+
+
+@pytest.mark.parametrize("torques", [(math.nan, 1.0), (1.0, math.inf), (-math.inf, math.nan)])
+def test_torque_that_is_not_finite_stops_the_drives(torques: tuple[float, float]) -> None:
+    bridge = make()
+    bridge.encode(0, 1, 5.0, 5.0)
+    assert decode(bridge.encode(10 * MS, 1, *torques)) == Torque(1, 0.0, 0.0, False, False, False, 1)
+    assert bridge.counts[1].stopped == {Stop.NOT_FINITE: 1}
+    assert (bridge.counts[1].smallest, bridge.counts[1].largest) == ((5.0, 5.0), (5.0, 5.0))
+    assert decode(bridge.encode(20 * MS, 1, 2.0, 2.0)) == Torque(1, 2.0, 2.0, True, False, False, 2)
+
+
+def test_old_torque_stops_the_drives_and_a_repeated_one_gives_nothing() -> None:
+    bridge = make()
+    bridge.encode(20 * MS, 0, 1.0, 1.0)
+    assert decode(bridge.encode(10 * MS, 0, 1.0, 1.0)) == Torque(0, 0.0, 0.0, False, False, False, 1)
+    assert bridge.encode(20 * MS, 0, 1.0, 1.0) == []
+    assert decode(bridge.encode(10 * MS, 1, 1.0, 1.0)).enable  # each robot has its own time
+    counts = bridge.counts[0]
+    assert (counts.frames, counts.stopped, counts.repeated) == (2, {Stop.STALE: 1}, 1)
+
+
+def test_periods_without_torque_are_counted() -> None:
+    bridge = make()
+    for step in (0, 1, 2, 5, 6, 10):
+        bridge.encode(step * 10 * MS + (step % 2 == 0), 0, 0.0, 0.0)  # a nanosecond of jitter is no period
+    assert bridge.counts[0].skipped == 2 + 3
+
+
+def test_stop_on_request() -> None:
+    bridge = make()
+    assert not decode(bridge.stop(1)).enable
+    assert not decode(bridge.stop(1, Stop.MISSING)).enable
+    assert bridge.counts[1].stopped == {Stop.REQUESTED: 1, Stop.MISSING: 1}
+
+
+def test_summary() -> None:
+    bridge = make()
+    bridge.encode(0, 0, 40.0, -1.0)
+    bridge.encode(10 * MS, 0, -2.0, 50.0, saturated=True)
+    bridge.encode(20 * MS, 0, math.nan, 0.0)
+    summary = json.loads(json.dumps(bridge.summary(), allow_nan=False))
+    assert summary["robots"]["g1/r1"] == {
+        "frames": 3,
+        "stopped": {"not finite": 1},
+        "repeated": 0,
+        "skipped": 0,
+        "clipped": 2,
+        "saturated": 1,
+        "torque_min": [-2.0, -1.0],
+        "torque_max": [40.0, 50.0],
+    }
+    assert summary["robots"]["g1/r2"]["torque_min"] is None
+    assert (summary["frames"], summary["torque_limit"]) == (3, pytest.approx(32.767))
+
+
+torques = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 1), torques, torques, st.booleans())))
+def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> None:
+    bridge = make()
+    checks = [CounterCheck(), CounterCheck()]
+    total = 0
+    for time, robot, right, left, saturated in calls:
+        for can_id, data in bridge.encode(time * 10 * MS, robot, right, left, saturated):
+            frame = CODEC.decode(can_id, data)
+            assert isinstance(frame, Torque)
+            assert frame.robot == robot
+            assert checks[robot].step(frame.counter) == 0
+            assert frame.enable or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
+            assert not frame.enable or (math.isfinite(right) and math.isfinite(left))
+            total += 1
+    assert total == bridge.frames == sum(counts.frames for counts in bridge.counts)
+    assert total + sum(counts.repeated for counts in bridge.counts) == len(calls)
+
+
+def test_refused() -> None:
+    with pytest.raises(ValueError, match="127 robots"):
+        Bridge(["r"] * 128, 0.001, 1)
+    with pytest.raises(ValueError, match="period"):
+        Bridge(["r"], 0.001, 0)
+    with pytest.raises(IndexError):
+        make().encode(0, 2, 0.0, 0.0)

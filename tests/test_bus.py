@@ -1,0 +1,234 @@
+"""Buses that need no privileges, URLs, and a bus that misbehaves."""
+
+import errno
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+import can
+import pytest
+
+from bridge.bus import Bus, interface_is_up, listen_command, open_bus, resolve_url
+
+FRAMES = [(0x100 + number % 9, number.to_bytes(8, "little")) for number in range(500)]
+
+
+@pytest.mark.parametrize(
+    ("url", "full"),
+    [
+        ("socketcan:can1", "socketcan:can1"),
+        ("udp_multicast", "udp_multicast:239.74.163.2:43113"),
+        ("udp_multicast:", "udp_multicast:239.74.163.2:43113"),
+        ("udp_multicast::5000", "udp_multicast:239.74.163.2:5000"),
+        ("udp_multicast:239.1.2.3", "udp_multicast:239.1.2.3:43113"),
+        ("udp_multicast:239.1.2.3:5000", "udp_multicast:239.1.2.3:5000"),
+        ("udp_multicast:[ff15::7]:5000", "udp_multicast:[ff15::7]:5000"),
+        ("virtual", "virtual:echelon"),
+        ("virtual:x", "virtual:x"),
+    ],
+)
+def test_urls(url: str, full: str) -> None:
+    assert resolve_url(url) == full
+    assert resolve_url(full) == full
+
+
+@pytest.mark.parametrize(
+    ("url", "named"),
+    [
+        ("", "''"),
+        ("vcan0", "'vcan0'"),
+        ("slcan:x", "'slcan'"),
+        ("socketcan", "''"),
+        ("socketcan:", "''"),
+        ("socketcan:an interface", "'an interface'"),
+        ("socketcan:much-too-long-a-name", "'much-too-long-a-name'"),
+        ("udp_multicast:10.0.0.1", "'10.0.0.1'"),
+        ("udp_multicast:239.1.2.3:x", "'239.1.2.3:x'"),
+        ("udp_multicast:239.1.2.3:0", "port 0"),
+        ("udp_multicast:239.1.2.3:65536", "port 65536"),
+        ("udp_multicast:ff15::7", "'ff15::7'"),
+        ("udp_multicast:[10.0.0.1]", "'10.0.0.1'"),
+    ],
+)
+@pytest.mark.parametrize("function", [resolve_url, listen_command, open_bus])
+def test_url_mistakes_name_the_value_and_what_is_allowed(url: str, named: str, function: Callable[[str], Any]) -> None:
+    with pytest.raises(ValueError, match="allowed: socketcan:INTERFACE, udp_multicast") as caught:
+        function(url)
+    assert repr(url) in str(caught.value)
+    assert named in str(caught.value)
+
+
+def test_auto_is_a_real_interface_or_a_port_of_its_own() -> None:
+    urls = {resolve_url("auto") for _ in range(5)}
+    if interface_is_up("vcan0"):
+        assert urls == {"socketcan:vcan0"}
+    else:
+        assert all(url.startswith("udp_multicast:239.74.163.2:") for url in urls)
+        assert "udp_multicast:239.74.163.2:43113" not in urls
+
+
+def test_how_to_listen() -> None:
+    assert listen_command("socketcan:vcan3") == "candump vcan3"
+    assert listen_command("udp_multicast:[ff15::7]:9") == "can_logger -i udp_multicast -c ff15::7 --bus-kwargs port=9"
+    assert listen_command("virtual:x") == ""
+
+
+def test_interface_is_up() -> None:
+    assert interface_is_up("lo")
+    assert not interface_is_up("no-such-one")
+
+
+def test_interface_that_is_missing() -> None:
+    with pytest.raises(OSError, match="cannot open CAN bus socketcan:nosuchcan0: "):
+        open_bus("socketcan:nosuchcan0")
+
+
+def own_url(kind: str) -> str:
+    # a port, or a channel, that nobody else has
+    return resolve_url("auto") if kind == "udp_multicast" else f"virtual:{uuid.uuid4()}"
+
+
+def open_or_skip(url: str) -> Bus:
+    try:
+        return open_bus(url)
+    except OSError as error:
+        pytest.skip(f"no multicast here: {error}")
+
+
+@pytest.mark.parametrize("kind", ["udp_multicast", "virtual"])
+def test_frames_arrive_whole_and_in_order(kind: str) -> None:
+    with open_or_skip(own_url(kind)) as sender, open_bus(sender.url) as receiver:
+        for number, (can_id, data) in enumerate(FRAMES):
+            assert sender.send(can_id, data, number * 1_000_000)
+        got = [receiver.recv(5.0) for _ in FRAMES]
+        assert [frame and (frame.can_id, frame.data, frame.remote) for frame in got] == [
+            (*one, False) for one in FRAMES
+        ]
+        assert receiver.recv(0.0) is None
+        if kind == "virtual":
+            assert [frame and frame.time_ns for frame in got] == [number * 1_000_000 for number in range(len(FRAMES))]
+        assert (sender.counts.sent, sender.counts.failed, sender.counts.dropped) == (len(FRAMES), 0, 0)
+
+
+def test_a_receiver_keeps_earlier_frames_when_later_ones_are_sent() -> None:
+    with open_bus(own_url("virtual")) as sender, open_bus(sender.url) as receiver:
+        sender.send(1, b"first")
+        sender.send(2, b"second")
+        first, second = receiver.recv(), receiver.recv()
+        assert first is not None
+        assert second is not None
+        assert (first.data, second.data) == (b"first", b"second")
+
+
+def test_a_bus_nobody_reads_drops_without_blocking() -> None:
+    with open_bus(own_url("virtual")) as sender, open_bus(sender.url):
+        sent = [sender.send(1, b"") for _ in range((1 << 16) + 10)]
+        assert (sum(sent), sender.counts.failed + sender.counts.dropped) == (1 << 16, 10)
+
+
+@pytest.mark.parametrize(("can_id", "data"), [(0x800, b""), (-1, b""), (1, bytes(9))])
+def test_no_classic_frame(can_id: int, data: bytes) -> None:
+    with open_bus(own_url("virtual")) as bus, pytest.raises(ValueError, match="classic"):
+        bus.send(can_id, data)
+
+
+class Socket:
+    """Stands for a raw CAN socket; each send takes the next of `answers`, an errno or 0."""
+
+    def __init__(self, answers: list[int], bind: int = 0) -> None:
+        self.answers = answers
+        self.bind_answer = bind
+        self.sent: list[bytes] = []
+
+    def send(self, frame: bytes, flags: int) -> int:
+        answer = self.answers.pop(0)
+        if answer:
+            raise OSError(answer, "refused")
+        self.sent.append(frame)
+        return len(frame)
+
+    def bind(self, address: tuple[str]) -> None:
+        assert address == ("vcan0",)
+        if self.bind_answer:
+            raise OSError(self.bind_answer, "refused")
+
+
+def raw_bus(answers: list[int], bind: int = 0) -> tuple[Bus, Socket, list[float]]:
+    raw, pauses = Socket(answers, bind), list[float]()
+    bus = Bus(can.Bus(interface="virtual", channel=str(uuid.uuid4())), "socketcan:vcan0", pauses.append)
+    bus._socket = raw  # type: ignore[assignment]
+    return bus, raw, pauses
+
+
+def test_bytes_on_a_raw_socket() -> None:
+    bus, raw, _ = raw_bus([0, 0])
+    assert bus.send(0x17E, b"\x01\x02")
+    assert bus.send(1, bytes(range(8)))
+    assert [frame.hex() for frame in raw.sent] == [
+        "7e010000020000000102000000000000",
+        "01000000080000000001020304050607",
+    ]
+    bus.close()
+
+
+def test_a_full_queue_is_retried_then_dropped_and_holds_up_only_once() -> None:
+    full = errno.ENOBUFS
+    bus, raw, pauses = raw_bus([full, errno.EAGAIN, 0] + [full] * 10 + [full] + [0] + [full, 0])
+    assert bus.send(1, b"")
+    assert len(pauses) == 2
+    assert not bus.send(2, b"")
+    assert len(pauses) == 12
+    assert not bus.send(3, b"")  # still full: tried once
+    assert len(pauses) == 13
+    assert bus.send(4, b"")
+    assert bus.send(5, b"")  # patient again
+    assert raw.answers == []
+    assert (bus.counts.sent, bus.counts.dropped, bus.counts.failed) == (3, 2, 0)
+    assert sum(pauses[2:12]) <= 0.005 + 1e-9
+    bus.close()
+
+
+class Grumbler:
+    """Stands for python-can's bus; each send takes the next of `answers`, an error or None."""
+
+    def __init__(self, answers: list[Exception | None]) -> None:
+        self.answers = answers
+        self.patience: list[float] = []
+
+    def send(self, message: can.Message, timeout: float) -> None:
+        self.patience.append(timeout)
+        if answer := self.answers.pop(0):
+            raise answer
+
+    def recv(self, timeout: float | None) -> None:
+        raise can.CanOperationError("not a frame")
+
+    def shutdown(self) -> None:
+        pass
+
+
+def test_trouble_on_other_buses_is_counted_and_holds_up_only_once() -> None:
+    with open_bus(own_url("virtual")) as bus:
+        bus._bus.shutdown()
+        full = can.CanOperationError("failed to send")
+        full.__cause__ = BlockingIOError(errno.EAGAIN, "full")
+        fake = Grumbler(
+            [can.CanTimeoutError(), full, None, can.CanOperationError("no route"), OSError("odd"), None, None]
+        )
+        bus._bus = fake  # type: ignore[assignment]
+        assert [bus.send(1, b"") for _ in range(7)] == [False, False, True, False, False, True, True]
+        assert [timeout > 0 for timeout in fake.patience] == [True, False, False, True, False, False, True]
+        assert (bus.counts.sent, bus.counts.dropped, bus.counts.failed) == (3, 2, 2)
+        assert bus.recv() is None
+        assert bus.counts.recv_failed == 1
+
+
+def test_an_interface_that_goes_down_or_away_is_survived() -> None:
+    bus, raw, pauses = raw_bus([errno.ENETDOWN, 0, errno.ENXIO, 0], bind=0)
+    assert [bus.send(1, b"") for _ in range(3)] == [False, True, True]
+    assert (bus.counts.sent, bus.counts.failed, pauses) == (2, 1, [])
+    raw.answers, raw.bind_answer = [errno.ENODEV, errno.ENXIO], errno.ENODEV
+    assert [bus.send(1, b"") for _ in range(2)] == [False, False]
+    assert bus.counts.failed == 3
+    assert isinstance(bus.error, OSError)
+    bus.close()

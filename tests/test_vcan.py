@@ -1,0 +1,79 @@
+"""Runs tests/vcan where there is a real vcan0: by deploy/vcan.sh, if need be in a guest, once for all of them."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from bridge.bus import interface_is_up
+
+ROOT = Path(__file__).parents[1]
+INSIDE = ROOT / "tests" / "vcan" / "test_vcan.py"
+SCRIPT = ROOT / "deploy" / "vcan.sh"
+NAMES = [
+    node.name
+    for node in ast.parse(INSIDE.read_text()).body
+    if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+]
+NO_VCAN = 125
+
+if interface_is_up("vcan0"):
+    pytest.skip("vcan0 is up: tests/vcan runs without a guest", allow_module_level=True)
+
+
+class Notice:
+    """Tells at the end of the run what was not tested; a line in the list of skips is easily overlooked."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        terminalreporter.section("NOT TESTED: real vcan", red=True, bold=True)
+        terminalreporter.line(self.text)
+
+
+@pytest.fixture(scope="module")
+def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """For each inner test that passed "", for the others what they said."""
+    report = tmp_path_factory.mktemp("vcan") / "junit.xml"
+    # fewer plugins, since imports are slow in a guest; its own folder for temporary files, in its own memory
+    options = ["-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest", "--basetemp=/dev/shm/pytest"]
+    command = [sys.executable, "-m", "pytest", *options, f"--junit-xml={report}", str(INSIDE.parent)]
+    run = subprocess.run(
+        [str(SCRIPT), *command],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=180,
+        check=False,
+    )
+    if run.returncode == NO_VCAN:
+        why = f"no vcan can be had here: {run.stderr.strip()}"
+        if os.environ.get("CI") or os.environ.get("ECHELON_REQUIRE_VCAN"):
+            pytest.fail(why)
+        request.config.pluginmanager.register(Notice(f"{len(NAMES)} tests of CAN frames on a real interface. {why}"))
+        pytest.skip(why)
+    if not report.exists():
+        pytest.fail(f"exit status {run.returncode}\n{run.stdout}\n{run.stderr}")
+    found = {}
+    for case in ElementTree.parse(report).iter("testcase"):
+        found[case.get("name", "")] = "\n".join(f"{part.tag}: {part.get('message')}\n{part.text}" for part in case)
+    return found
+
+
+def test_all_of_them_ran(results: dict[str, str]) -> None:
+    assert sorted(results) == sorted(NAMES)
+    assert NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_guest(results: dict[str, str], name: str) -> None:
+    said = results.get(name, "did not run")
+    if said.startswith("skipped"):
+        pytest.skip(said)
+    assert not said, said

@@ -1,0 +1,12 @@
+"""These tests need a vcan0 that is up; where there is none, tests/test_vcan.py runs them in a guest that has one."""
+
+import pytest
+
+from bridge.bus import interface_is_up
+
+if not interface_is_up("vcan0"):
+    collect_ignore_glob = ["test_*.py"]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "vcan: needs a real SocketCAN interface")

@@ -1,0 +1,183 @@
+"""Frames on a real SocketCAN interface, seen by others than this project."""
+
+import re
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from bridge.bridge import Bridge, Frame
+from bridge.bus import Bus, listen_command, open_bus, resolve_url
+from bridge.dbc import torque_dbc
+from bridge.native import NativeCodec, Torque
+
+pytestmark = pytest.mark.vcan
+
+ROBOTS = [f"g{group}/r{robot}" for group in (1, 2, 3) for robot in (1, 2, 3)]
+STEPS = 250
+SCALE = 0.001
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with open_bus("socketcan:vcan0") as opened:
+        yield opened
+
+
+def listener(interface: str = "vcan0") -> socket.socket:
+    """A plain socket of the kernel's, with room for all frames of a test."""
+    raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+    raw.bind((interface,))
+    raw.settimeout(10.0)
+    return raw
+
+
+def next_frame(raw: socket.socket) -> Frame:
+    can_id, length, data = struct.unpack("=IB3x8s", raw.recv(16))
+    return can_id, data[:length]
+
+
+def torques(step: int, robot: int) -> tuple[float, float]:
+    return 0.0123 * step - robot, 0.00045678 * step * robot
+
+
+def run(bus: Bus) -> list[Frame]:
+    """Sends STEPS periods of all robots through a bridge."""
+    bridge = Bridge(ROBOTS, SCALE, 10_000_000)
+    sent = []
+    for step in range(STEPS):
+        for robot in range(len(ROBOTS)):
+            for can_id, data in bridge.encode(step * 10_000_000, robot, *torques(step, robot)):
+                bus.send(can_id, data, step * 10_000_000)
+                sent.append((can_id, data))
+    assert len(sent) == bridge.frames == STEPS * len(ROBOTS) >= 2000
+    return sent
+
+
+def test_an_independent_socket_gets_every_frame(bus: Bus) -> None:
+    with listener() as raw:
+        sent = run(bus)
+        assert [next_frame(raw) for _ in sent] == sent
+        raw.settimeout(0.0)
+        with pytest.raises(BlockingIOError):
+            raw.recv(16)
+    assert (bus.counts.sent, bus.counts.failed, bus.counts.dropped) == (len(sent), 0, 0)
+    codec = NativeCodec(SCALE)
+    for number, (can_id, data) in enumerate(sent):
+        step, robot = divmod(number, len(ROBOTS))
+        frame, (right, left) = codec.decode(can_id, data), torques(step, robot)
+        assert isinstance(frame, Torque)
+        assert (frame.robot, frame.counter) == (robot, step % 16)
+        assert abs(frame.tau_right - right) <= SCALE * 0.500001
+        assert abs(frame.tau_left - left) <= SCALE * 0.500001
+
+
+def somebody_listens() -> bool:
+    """Whether a socket that takes all frames is bound to vcan0; the buses of this project filter."""
+    return re.search(r"^ +vcan0 +0", Path("/proc/net/can/rcvlist_all").read_text(), re.MULTILINE) is not None
+
+
+def test_candump_and_cantools_show_newton_metres(bus: Bus, tmp_path: Path) -> None:
+    dbc = tmp_path / "torque.dbc"
+    dbc.write_text(torque_dbc(ROBOTS, SCALE, 10_000_000))
+    total = STEPS * len(ROBOTS)
+    # as a user types it, but for its end: after all frames, or ten seconds of silence
+    with (
+        subprocess.Popen(
+            [*listen_command(bus.url).split(), "-n", str(total), "-T", "10000"], stdout=subprocess.PIPE
+        ) as one,
+        subprocess.Popen(
+            [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)],
+            stdin=one.stdout,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as two,
+    ):
+        limit = time.monotonic() + 20
+        while not somebody_listens() and time.monotonic() < limit:
+            assert one.poll() is None
+        run(bus)
+        assert one.stdout is not None
+        one.stdout.close()
+        shown = two.communicate(timeout=50)[0].splitlines()
+    assert len(shown) == total
+    number = r"(-?[0-9.e-]+)"
+    for index, line in enumerate(shown):
+        step, robot = divmod(index, len(ROBOTS))
+        found = re.search(
+            rf":: (\w+)\(tau_right: {number} Nm, tau_left: {number} Nm, enable: 1, clipped: 0,", line
+        )
+        assert found is not None, line
+        assert found[1] == f"torque_{ROBOTS[robot].replace('/', '_')}"
+        right, left = torques(step, robot)
+        assert abs(float(found[2]) - right) <= SCALE * 0.500001
+        assert abs(float(found[3]) - left) <= SCALE * 0.500001
+
+
+def ip(*words: str) -> None:
+    done = subprocess.run(["ip", "link", *words], capture_output=True, text=True, timeout=10, check=False)
+    if "not permitted" in done.stderr:
+        pytest.skip("no right to change interfaces")
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_interface_going_down_and_away_is_survived() -> None:
+    data = bytes(range(8))
+    ip("add", "vcan1", "type", "vcan")
+    try:
+        ip("set", "vcan1", "up")
+        with open_bus("socketcan:vcan1") as bus:
+            assert bus.send(1, data)
+            ip("set", "vcan1", "down")
+            assert [bus.send(2, data) for _ in range(3)] == [False] * 3
+            ip("set", "vcan1", "up")
+            with listener("vcan1") as raw:
+                assert bus.send(3, data)
+                assert next_frame(raw) == (3, data)
+            ip("del", "vcan1")
+            assert [bus.send(4, data) for _ in range(3)] == [False] * 3
+            ip("add", "vcan1", "type", "vcan")
+            ip("set", "vcan1", "up")
+            with listener("vcan1") as raw:
+                assert bus.send(5, data)
+                assert next_frame(raw) == (5, data)
+            assert (bus.counts.sent, bus.counts.failed, bus.counts.dropped) == (3, 6, 0)
+    finally:
+        ip("del", "vcan1")
+
+
+def test_receiving_from_others(bus: Bus) -> None:
+    with listener() as other:
+        for can_id in (0x80000123, 0x20000004, 0x40000105, 0x101):  # extended, error, remote, plain
+            other.send(struct.pack("=IB3x8s", can_id, 8, b"01234567"))
+    got = [bus.recv(10.0), bus.recv(10.0)]
+    assert [frame and (frame.can_id, frame.remote) for frame in got] == [(0x105, True), (0x101, False)]
+    assert got[1] is not None
+    assert got[1].data == b"01234567"
+    assert bus.recv(0.0) is None
+
+
+def test_a_receiver_holds_a_burst(bus: Bus) -> None:
+    with open_bus("socketcan:vcan0") as receiver:
+        sent = run(bus)
+        got = [receiver.recv(10.0) for _ in sent]
+    assert [frame and (frame.can_id, frame.data) for frame in got] == sent
+    assert bus.recv(0.0) is None  # what it sent itself does not come back
+
+
+def test_auto_is_this_interface() -> None:
+    assert resolve_url("auto") == "socketcan:vcan0"
+
+
+def test_multicast_beside_it() -> None:
+    with open_bus("udp_multicast::47113") as sender, open_bus(sender.url) as receiver:
+        assert sender.send(0x101, b"torque")
+        frame = receiver.recv(10.0)
+        assert frame is not None
+        assert (frame.can_id, frame.data) == (0x101, b"torque")

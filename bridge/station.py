@@ -33,7 +33,7 @@ class Station:
         self._bridge = Bridge(robots, plan.can.torque_scale, [robot.period_ns for robot in plan.robots])
         self._bus = open_bus(url)
         self.url = self._bus.url
-        dbc = torque_dbc(robots, plan.can.torque_scale, [robot.period_ns for robot in plan.robots])
+        dbc = torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns)
         (folder / "torque.dbc").write_text(dbc, encoding="utf-8")
         self._log = CanLog(folder / "can.log", LOG_CHANNEL, epoch_ns)
         self._source = len(plan.members)

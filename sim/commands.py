@@ -49,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     can_url = arguments.can or plan.can.url
     if arguments.can == "none" or not (plan.can.enabled or arguments.can):
         can_url = ""
+    if can_url == "auto" and arguments.engine == "inprocess":
+        can_url = "virtual"  # one process needs no bus to others; name one to be heard
     if can_url:
         can_url = _checked_bus(can_url)
     try:
@@ -102,7 +104,7 @@ def _checked_bus(url: str) -> str:
 
 def validate(arguments: argparse.Namespace) -> int:
     """`echelon validate`"""
-    from bridge.load import explain
+    from bridge.bus_load import explain
 
     scenario, plan = scenario_of(arguments)
     rate = 1e9 / plan.robots[0].period_ns
@@ -158,8 +160,8 @@ def _first_frames(path: Path, plan: Plan, codec: Any, count: int = 18) -> tuple[
                     "t [s]": f"{time_ns / 1e9:.6f}",
                     "frame": f"{identifier:03X}#{data.hex().upper()}",
                     "robot": plan.robots[torque.robot].name if torque.robot < len(plan.robots) else "?",
-                    "τ right [N m]": f"{torque.right:g}",
-                    "τ left [N m]": f"{torque.left:g}",
+                    "τ right [N m]": f"{torque.tau_right:g}",
+                    "τ left [N m]": f"{torque.tau_left:g}",
                     "counter": torque.counter,
                 }
             )
@@ -211,7 +213,7 @@ def recover(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{error.filename or arguments.file}: {error.strerror}") from None
     except ValueError as error:
         raise UsageError(f"{arguments.file}: {error}") from None
-    print(f"{target}: {result.messages} messages, up to t = {result.end_ns / 1e9:g} s")
+    print(f"{target}: {result.messages} messages, up to t = {(result.until_ns or 0) / 1e9:g} s")
     return 0
 
 

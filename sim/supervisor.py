@@ -414,7 +414,6 @@ def _specs(
 ) -> list[ProcessSpec]:
     """Lists the processes of a run: every node listens, its children connect; all members connect to the watchers."""
     endpoint = {node.index: f"unixsock-stream/{sockets}/{node.index}" for node in plan.nodes}
-    kind = {member.index: "robot" if isinstance(member, RobotPlan) else member.role for member in plan.members}
     watchers = ([("recorder", "recorder")] if recorded else []) + ([("bridge", "bridge")] if can_url else [])
     watcher_endpoint = {name: f"unixsock-stream/{sockets}/{name}" for _, name in watchers}
     specs = []
@@ -424,7 +423,7 @@ def _specs(
         specs.append(
             ProcessSpec(
                 run=run,
-                kind=kind[member.index],
+                kind=member.role,
                 name=member.name,
                 index=member.index,
                 plan=plan,
@@ -434,11 +433,11 @@ def _specs(
                     *(() if member.parent is None else (endpoint[member.parent],)),
                     *watcher_endpoint.values(),
                 ),
-                peers=(*((kind[peer], plan.members[peer].name) for peer in peers), *watchers),
+                peers=(*((plan.members[peer].role, plan.members[peer].name) for peer in peers), *watchers),
                 watched=bool(watchers),
             )
         )
-    everyone = tuple((kind[member.index], member.name) for member in plan.members)
+    everyone = tuple((member.role, member.name) for member in plan.members)
     for watcher, name in watchers:
         others = tuple(endpoint for other, endpoint in watcher_endpoint.items() if other != name)
         specs.append(

@@ -91,7 +91,7 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     sources = ends(plan)
     if spec.can_url:
         sources[len(plan.members)] = plan.duration_ns - plan.duration_ns % plan.robots[0].period_ns
-    reception = Reception(session.subscribe(watch_key(spec.run, "**"), backpressure=True, high_water=HIGH_WATER), sources)
+    reception = Reception(session.subscribe(watch_key(spec.run, "*", "**"), backpressure=True, high_water=HIGH_WATER), sources)
     recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
     meet(spec, session, control)
     said_s = time.monotonic()
@@ -164,12 +164,11 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
 
     plan = spec.plan
     all_ends = ends(plan)
-    keys = [watch_key(spec.run, robot.path) for robot in plan.robots]
     reception = Reception(
-        session.subscribe(keys, backpressure=True, high_water=HIGH_WATER),
+        session.subscribe(watch_key(spec.run, "robot", "**"), backpressure=True, high_water=HIGH_WATER),
         {robot.index: all_ends[robot.index] for robot in plan.robots},
     )
-    publisher = session.publisher(watch_key(spec.run, "bridge"))
+    publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
     station = Station(plan, spec.can_url, Path(spec.folder))
     control.send(("bus", station.url))
     meet(spec, session, control)

@@ -1,0 +1,180 @@
+"""The command line as a user types it: what it leaves, what it says, how it ends."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cantools
+import pytest
+
+from runs import ROOT, echelon, plan_of, trace_of
+from sim.recording import read_links, read_metadata, read_scenario, read_trace
+
+QUICK = ("--set", "duration=0.2", "--set", "claims=[]")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short run in one process."""
+    folder = tmp_path_factory.mktemp("runs") / "short"
+    done = echelon("run", "paper", *QUICK, "--engine", "inprocess", "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_run_leaves_its_folder(folder: Path) -> None:
+    names = {"scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html"}
+    assert {file.name for file in folder.iterdir()} == names
+    plan = plan_of("paper", "duration=0.2")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["trace_digest"] == trace_of(plan).digest() == read_trace(folder / "run.mcap", plan).digest()
+    assert summary["verdict"] == {"holds": True, "reasons": []}
+    assert summary["can"]["frames"] == 9 * 200
+    assert read_scenario(folder / "run.mcap") == (folder / "scenario.toml").read_text()
+    assert read_metadata(folder / "run.mcap")["engine"] == "inprocess"
+    assert len(read_links(folder / "run.mcap")) == 24
+    page = (folder / "report.html").read_text()
+    assert "<script" not in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_effective_scenario_runs_again_to_the_same_trace(folder: Path, tmp_path: Path) -> None:
+    again = echelon(
+        *("run", folder / "scenario.toml", "--engine", "inprocess", "--json", "--quiet", "--no-report"),
+        *("--can", "none", "--out", tmp_path / "again"),
+    )
+    assert again.returncode == 0, again.stderr
+    summary = json.loads(again.stdout)
+    assert summary["trace_digest"] == json.loads((folder / "summary.json").read_text())["trace_digest"]
+
+
+def test_can_log_decodes_to_the_torques_of_the_trace(folder: Path) -> None:
+    database = cantools.database.load_file(folder / "torque.dbc")
+    trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=0.2"))
+    lines = (folder / "can.log").read_text().splitlines()
+    assert len(lines) == 9 * 200
+    for number, line in enumerate(lines):
+        stamp, _, frame = line.split()
+        identifier, data = frame.split("#")
+        tick, robot = divmod(number, 9)
+        assert float(stamp.strip("()")) == pytest.approx((tick + 1) / 1000)
+        signals = database.decode_message(int(identifier, 16), bytes.fromhex(data))
+        wanted = trace.states[robot][tick + 1]
+        assert signals["tau_right"] == pytest.approx(wanted[9], abs=2.5 + 1e-9)
+        assert signals["tau_left"] == pytest.approx(wanted[10], abs=2.5 + 1e-9)
+
+
+def test_a_failed_claim_is_exit_code_1(tmp_path: Path) -> None:
+    done = echelon("run", "paper", "--set", "duration=0.2", "--engine", "inprocess", "--quiet", "--out", tmp_path)
+    assert done.returncode == 1
+    assert "FAILS" in done.stdout
+    assert "centroid" in done.stdout
+
+
+def test_a_diverged_run_says_so_and_its_summary_is_json(tmp_path: Path) -> None:
+    links = 'links=[{source="**",receiver="*",channel="state",delay=0.02}]'
+    done = echelon(
+        *("run", "paper", "--set", "duration=1.5", "--set", links, "--engine", "inprocess", "--quiet", "--out", tmp_path)
+    )
+    assert done.returncode == 1, done.stderr
+    assert "not finite" in done.stdout
+    json.loads((tmp_path / "summary.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert (tmp_path / "report.html").exists()
+
+
+def test_plain_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
+    done = echelon("run", "lab", "--set", "duration=3", "--clock", "wall", "--engine", "inprocess", "--out", tmp_path)
+    assert "real time" in done.stderr
+    assert "\x1b" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("run", "nosuch"), "nosuch: no such file, and no shipped scenario; those are lab,"),
+        (("validate", "no/such.toml"), "no/such.toml: No such file"),
+        (("run", "paper", "--set", "law.epsilon=[0.1]"), "law.epsilon"),
+        (("run", "paper", "--set", "duratoin=3"), "did you mean 'duration'"),
+        (("run", "paper", "--set", "duration"), "key=value"),
+        (("run", "paper", "--can", "serial:1"), "serial"),
+        (("run", "paper", "--out", "/proc/nowhere"), "--out /proc/nowhere"),
+        (("report", "no-such-run"), "no-such-run"),
+        (("export", "no-such-run", "--csv", "x"), "no-such-run"),
+        (("recover", "no-such-file"), "no-such-file"),
+        (("dbc", "nosuch"), "nosuch"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(arguments: tuple[str, ...], says: str) -> None:
+    done = echelon(*arguments)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not done.stdout
+
+
+def test_recover_refuses_what_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "not.mcap").write_text("hello")
+    done = echelon("recover", tmp_path / "not.mcap")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_recover_mends_a_cut_recording(folder: Path, tmp_path: Path) -> None:
+    whole = (folder / "run.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    done = echelon("recover", tmp_path / "cut.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "messages, up to t =" in done.stdout
+    read_trace(tmp_path / "cut-recovered.mcap", plan_of("paper", "duration=0.2"))
+
+
+def test_export_writes_tables(folder: Path, tmp_path: Path) -> None:
+    assert echelon("export", folder, "--csv", tmp_path).returncode == 0
+    trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=0.2"))
+    with (tmp_path / "robots.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == "t robot x y theta v omega ax ay tau_right tau_left".split()
+    assert len(rows) == 9 * 201
+    last = next(row for row in reversed(rows) if row["robot"] == "g1/r2")
+    assert float(last["x"]) == trace.states[0][-1][0]
+    assert (tmp_path / "blocks.csv").read_text().startswith("t,block,component,value,desired,error,rate\n")
+    assert (tmp_path / "links.csv").exists()
+
+
+def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
+    page = tmp_path / "both.html"
+    assert echelon("report", folder, folder, "--out", page).returncode == 0
+    assert page.stat().st_size > 10_000
+
+
+def test_validate_explains_and_speaks_json() -> None:
+    done = echelon("validate", "paper", "--json")
+    assert done.returncode == 0
+    facts = json.loads(done.stdout)
+    assert facts["robots"] == 9
+    assert "does not fit" in facts["can"]
+    assert "fits" in json.loads(echelon("validate", "lab", "--json").stdout)["can"]
+
+
+def test_dbc_is_what_candump_and_cantools_need() -> None:
+    done = echelon("dbc", "lab")
+    database = cantools.database.load_string(done.stdout, "dbc")
+    assert len(database.messages) == 9
+    signal = database.get_message_by_name("torque_g1_r3").get_signal_by_name("tau_right")
+    assert (signal.unit, signal.scale) == ("Nm", 0.001)
+
+
+def test_help_teaches() -> None:
+    done = echelon("--help")
+    assert done.returncode == 0
+    assert "echelon run paper" in done.stdout
+    assert "exit codes" in done.stdout
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    command = f"{sys.executable} -m echelon.cli dbc paper | head -n 1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0
+    assert not done.stderr

@@ -28,10 +28,11 @@ os.environ.setdefault(
     "(rx:(handover:app),tx:(handover:app),acc:(handover:app),net:(handover:app),app:(worker_threads:1))",
 )
 
-import zenoh  # noqa: E402  (after its environment)
+import zenoh  # noqa: E402 - after its environment
 
-MAX_PAYLOAD: Final = 60_000
-"""Longest payload in bytes. The lockstep transport drops, without a word, what does not fit one batch of 64 KiB."""
+MAX_PAYLOAD: Final = 48_000
+"""Longest payload in bytes. The lockstep transport drops, without a word, a message that does not fit one batch, and on
+the TCP loopback a batch is 48 KiB."""
 
 _SUN_PATH: Final = 107  # bytes in the path of a Unix socket
 _UNBOUNDED: Final = 1 << 20  # samples; a lockstep has only a few under way
@@ -52,52 +53,48 @@ class Inbox:
     ) -> list[bytes]:
         """Return and forget all that was received, waiting until there are `at_least` payloads.
 
-        With `keys`, some of those subscribed to, wait instead until each of them has delivered something: the cheap way to
-        wait for several. Payloads of one key come in the order they were put. What there is is returned, be it less, after
-        `timeout_s` or when another thread calls `wake`. `at_least=0` never waits.
+        With `keys`, some of those subscribed to, wait instead until each of them has delivered something; without, an
+        inbox of several keys has to poll. Payloads of one key come in the order they were put. After `timeout_s`, or
+        when another thread calls `wake`, what there is is returned. `at_least=0` never waits.
         """
         taken: list[bytes] = []
-        missing = list(keys or ())
-        for key, channel in self._channels.items():
-            before = len(taken)
+        if keys is None and len(self._channels) == 1:
+            missing = list(self._channels) * at_least
+        else:
+            missing = list(keys or ())
+        if missing or (keys is None and at_least):
+            if timeout_s is not None:
+                self._deadline = time.monotonic() + timeout_s
+                self._session._alarm.expect(self._deadline)
+            if missing:
+                self._wait_for(missing, taken)
+            else:
+                self._poll(at_least, taken)
+            self._deadline, self._waiting, self._woken = math.inf, None, False
+        self._drain(taken)
+        return taken
+
+    def _drain(self, taken: list[bytes]) -> None:
+        for channel in self._channels.values():
             while (sample := channel.try_recv()) is not None:
                 if payload := sample.payload.to_bytes():  # an empty one only ends a wait, see `_end_wait`
                     taken.append(payload)
-            if len(taken) > before and key in missing:
-                missing.remove(key)
-        if missing or (keys is None and len(taken) < at_least):
-            self._deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
-            if timeout_s is not None:
-                self._session._alarm.expect(self, self._deadline)
-            if missing:
-                self._wait_for(missing, taken)
-            elif len(self._channels) == 1:
-                self._wait_for(list(self._channels) * (at_least - len(taken)), taken)
-            else:
-                self._poll(at_least, taken)
-            self._deadline, self._woken = math.inf, False
-        return taken
 
     def _wait_for(self, missing: list[str], taken: list[bytes]) -> None:
         # The last is waited for first: when it delivers, the others mostly have, and there was one wake-up for all.
         while missing:
-            self._waiting = key = missing.pop()
-            receive = self._channels[key].recv
-            payload = b""
-            while not payload and not self._expired():
-                payload = receive().payload.to_bytes()
-            self._waiting = None
-            if not payload:
+            self._waiting = key = missing[-1]
+            if self._expired():
                 return
-            taken.append(payload)
+            if payload := self._channels[key].recv().payload.to_bytes():
+                taken.append(payload)
+                missing.pop()
 
     def _poll(self, at_least: int, taken: list[bytes]) -> None:
+        self._drain(taken)
         while len(taken) < at_least and not self._expired():
             time.sleep(5e-5)
-            for channel in self._channels.values():
-                while (sample := channel.try_recv()) is not None:
-                    if payload := sample.payload.to_bytes():
-                        taken.append(payload)
+            self._drain(taken)
 
     def _expired(self) -> bool:
         return self._woken or (self._deadline != math.inf and time.monotonic() >= self._deadline)
@@ -169,8 +166,8 @@ class Tokens:
 class Session:
     """An open connection to those it listens for and connects to, who may start before or after it.
 
-    Endpoints read `tcp/host:port` or `unixsock-stream//path`. Data and tokens reach the processes at the other end of its
-    own links and no further.
+    Endpoints read `tcp/host:port` or `unixsock-stream//path`. Data and tokens reach the processes at the other end of
+    its own links and no further.
     """
 
     def __init__(self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> None:
@@ -184,9 +181,9 @@ class Session:
     def subscribe(self, keys: str | Iterable[str], *, backpressure: bool = False, high_water: int = 1024) -> Inbox:
         """Receive what is put under any of `keys`. Exact keys are cheaper than wildcards.
 
-        On the wall clock the newest `high_water` payloads of each key are kept. In lockstep all are; with `backpressure`,
-        when there are `high_water` of a key, *everything* this process receives stands still, and then those who send to
-        it, until something is taken: only for a process that takes all the time and waits for nothing else.
+        On the wall clock the newest `high_water` payloads of each key are kept. In lockstep all are; with
+        `backpressure`, when there are `high_water` of a key, *everything* this process receives stands still, and then
+        those who send to it, until something is taken: only for a process that takes and waits for nothing else.
         """
         channels: dict[str, zenoh.handlers.Handler[zenoh.Sample]] = {}
         for key in [keys] if isinstance(keys, str) else keys:
@@ -198,7 +195,9 @@ class Session:
                 subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(high_water))
             self._kept.append(subscriber)
             channels[key] = subscriber.handler
-        return Inbox(channels, self)
+        inbox = Inbox(channels, self)
+        self._alarm.add(inbox)
+        return inbox
 
     def publisher(self, key: str) -> Publisher:
         """Declare that this process will put payloads under `key`."""
@@ -208,11 +207,11 @@ class Session:
         return Publisher(publisher)
 
     def declare_token(self, key: str) -> None:
-        """Show that this process is alive until its session ends. Whoever sees the token reaches all declared before it."""
+        """Show that this process is alive until its session ends. Who sees the token reaches all declared before it."""
         self._kept.append(self._session.liveliness().declare_token(key))
 
     def watch_tokens(self, key: str, on_lost: Callable[[str], None] | None = None) -> Tokens:
-        """Follow the tokens under `key`. `on_lost` is called, in a thread of its own, with the key of each that ends."""
+        """Follow the tokens under `key`. `on_lost` is called, in a thread of its own, with the key of one that ends."""
         tokens = Tokens(on_lost)
         self._kept.append(self._session.liveliness().declare_subscriber(key, tokens._receive, history=True))
         return tokens
@@ -245,8 +244,8 @@ class Session:
 def loopback_endpoints(count: int) -> list[str]:
     """Endpoints for the processes of one run on this machine, free at the moment of asking.
 
-    TCP, because a Unix socket also wakes the sender's thread whenever the receiver has read: a tenth slower in lockstep.
-    Every run draws an address of its own in 127.0.0.0/8, so that runs do not meet.
+    TCP, because a Unix socket also wakes the sender's thread whenever the receiver has read: slower in lockstep. Every
+    run draws an address of its own in 127.0.0.0/8, so that runs do not meet.
     """
     host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
     probes = [socket.create_server((host, 0)) for _ in range(count)]
@@ -257,7 +256,7 @@ def loopback_endpoints(count: int) -> list[str]:
 
 
 class _Alarm:
-    """Ends the waits of inboxes at their deadlines. Its thread sleeps until the earliest, so that waiting costs nothing."""
+    """Ends the waits of inboxes at their deadlines. Its thread sleeps until the earliest: a wait costs nothing more."""
 
     def __init__(self) -> None:
         self._inboxes: list[Inbox] = []
@@ -266,19 +265,18 @@ class _Alarm:
         self._thread: threading.Thread | None = None
         self._stopped = False
 
-    def expect(self, inbox: Inbox, deadline: float) -> None:
+    def add(self, inbox: Inbox) -> None:
+        with self._changed:
+            self._inboxes.append(inbox)
+
+    def expect(self, deadline: float) -> None:
         if deadline < self._next:  # rarely: deadlines mostly move on, and the thread sees the new one when it wakes
             with self._changed:
-                if inbox not in self._inboxes:
-                    self._inboxes.append(inbox)
                 self._next = deadline
                 if self._thread is None:
                     self._thread = threading.Thread(target=self._run, name="inbox-alarm", daemon=True)
                     self._thread.start()
                 self._changed.notify()
-        elif inbox not in self._inboxes:
-            with self._changed:
-                self._inboxes.append(inbox)
 
     def stop(self) -> None:
         with self._changed:
@@ -335,7 +333,7 @@ def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zeno
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise ValueError(f"cannot listen on {', '.join(listen)} and connect to {', '.join(connect)}: {error}") from error
+        raise ValueError(f"cannot listen on {', '.join(listen) or 'nothing'}: {error}") from error
 
 
 def _check(endpoint: str) -> None:

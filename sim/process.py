@@ -134,7 +134,6 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
     start_ns = meet(spec, session, control)
     try:
         if spec.virtual:
-            _batch_scheduling()
             runner.lockstep(lambda time_ns, sources: control.send(("waiting", time_ns, sources)))
         else:
             runner.wall_clock(start_ns)
@@ -155,11 +154,3 @@ def _die_with_parent() -> None:
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() == 1:
         os._exit(1)
-
-
-def _batch_scheduling() -> None:
-    """Asks for long time slices without preemption by wake-ups: in a lockstep everyone waits for everyone anyway."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    except OSError:
-        pass

@@ -2,13 +2,11 @@
 
 All processes come from one fork server that has imported what they need, so fifteen start in the time of one.  Nothing
 outlives the supervisor: processes die with the fork server, and that ends when the supervisor does, even by kill -9.
-The sockets between them lie in a private folder that is gone as soon as all are connected.
+They talk over the loopback, at an address and ports of this run's own.
 """
 
 import os
-import shutil
 import signal
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
@@ -21,6 +19,7 @@ from typing import Any, Final
 
 from echelon.link import LinkCounts
 from echelon.plan import Plan, RobotPlan
+from echelon.session import loopback_endpoints
 from sim.process import ProcessSpec, Result, main
 from sim.trace import Trace, TraceBuilder
 
@@ -122,13 +121,10 @@ class Supervisor:
         self.progress = Progress()
         self._show = show
         self._stall_timeout_s = stall_timeout_s
-        self._sockets = Path(tempfile.mkdtemp(prefix="echelon-", dir=_short_folder()))
-        self._specs = order(
-            _specs(plan, run, virtual, self._sockets, folder, can_url, scenario_toml, metadata or {}, recorded)
-        )
+        self._specs = order(_specs(plan, run, virtual, folder, can_url, scenario_toml, metadata or {}, recorded))
         self._children: list[_Child] = []
         self._moved_s = 0.0
-        self._moved_ns = -1
+        self._moved_at = (-1, -1)
         self._warned = False
 
     def run(self) -> Outcome:
@@ -140,7 +136,6 @@ class Supervisor:
         try:
             self._start()
             self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
-            shutil.rmtree(self._sockets, ignore_errors=True)
             startup_s = time.monotonic() - begun_s
             start_s = time.monotonic() + (0.0 if self.virtual else WALL_START_S)
             self._tell_all(("start", round(start_s * 1e9)))
@@ -166,7 +161,6 @@ class Supervisor:
             failure = failure or "interrupted"
         finally:
             self._take_down()
-            shutil.rmtree(self._sockets, ignore_errors=True)
             signal.signal(signal.SIGTERM, previous)
         return self._outcome(failure, startup_s, wall_s)
 
@@ -278,8 +272,8 @@ class Supervisor:
         if self.progress.phase != "running" or not self.virtual:
             return
         at = (self.progress.time_ns, max((child.waiting_ns for child in self._children), default=-1))
-        if at != self._moved_ns:
-            self._moved_ns, self._moved_s = at, now_s  # type: ignore[assignment]
+        if at != self._moved_at:
+            self._moved_at, self._moved_s = at, now_s
             if self._warned:
                 self._warned, self.progress.note = False, "goes on"
             return
@@ -405,7 +399,6 @@ def _specs(
     plan: Plan,
     run: str,
     virtual: bool,
-    sockets: Path,
     folder: Path,
     can_url: str,
     scenario_toml: str,
@@ -413,9 +406,10 @@ def _specs(
     recorded: bool,
 ) -> list[ProcessSpec]:
     """Lists the processes of a run: every node listens, its children connect; all members connect to the watchers."""
-    endpoint = {node.index: f"unixsock-stream/{sockets}/{node.index}" for node in plan.nodes}
     watchers = ([("recorder", "recorder")] if recorded else []) + ([("bridge", "bridge")] if can_url else [])
-    watcher_endpoint = {name: f"unixsock-stream/{sockets}/{name}" for _, name in watchers}
+    endpoints = loopback_endpoints(len(plan.nodes) + len(watchers))
+    endpoint = {node.index: endpoints.pop() for node in plan.nodes}
+    watcher_endpoint = {name: endpoints.pop() for _, name in watchers}
     specs = []
     for member in plan.members:
         peers = [] if member.parent is None else [member.parent]
@@ -459,11 +453,6 @@ def _specs(
         )
     # Those that import most start first.
     return sorted(specs, key=lambda spec: spec.kind not in ("recorder", "bridge"))
-
-
-def _short_folder() -> str | None:
-    """Returns where sockets can lie: a path of theirs must not exceed 107 bytes."""
-    return None if len(tempfile.gettempdir()) < 60 else "/tmp"
 
 
 def _interrupt(number: int, frame: object) -> None:

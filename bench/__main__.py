@@ -1,0 +1,33 @@
+"""`python -m bench`: the lockstep beside its peers, then whole runs, in one go on one machine."""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+from bench import lockstep, product
+
+
+def main() -> int:
+    """Measures and prints everything; the exit code is 1 if a peer failed."""
+    parser = argparse.ArgumentParser(prog="python -m bench", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--ticks", type=int, default=2000, help="ticks of a lockstep; slow peers run a fifth (default 2000)")
+    parser.add_argument("--repeat", type=int, default=5, help="runs of each kind (default 5)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="run time of paper.toml (default 3)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    options = parser.parse_args()
+    machine = lockstep.machine()
+    runs, failures = lockstep.compare(list(lockstep.PEERS), options.ticks, options.repeat)
+    rows = product.measure(options.repeat, options.seconds)
+    if options.json:
+        peers = {name: [asdict(one) for one in found] for name, found in runs.items()}
+        print(json.dumps({"machine": machine, "peers": peers, "failures": failures, "runs": [asdict(r) for r in rows]}))
+    else:
+        print("  ".join(f"{key} {value}" for key, value in machine.items()), end="\n\n")
+        print(lockstep.table(runs, failures), end="\n\n")
+        print(product.table(rows))
+    return 1 if any(text.startswith("failed") for text in failures.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

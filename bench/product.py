@@ -1,0 +1,98 @@
+"""What whole runs cost: the paper's scenario as processes with everything on, the lab's in one process, start-up, memory."""
+
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.bus import resolve_url
+from echelon.load import effective_toml, load
+from sim.commands import SCENARIOS
+from sim.engine import Engine
+from sim.live import Display
+from sim.run import execute
+from sim.supervisor import Supervisor
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table: what was measured, its unit, and each repeat's value."""
+
+    what: str
+    unit: str
+    values: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """The value to quote."""
+        return statistics.median(self.values)
+
+
+def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float, float, float]:
+    """Runs `seconds` of paper.toml as processes; returns ticks/s, start-up [s], most memory of a robot process [MB]."""
+    scenario, plan = load(SCENARIOS / "paper.toml", [f"duration={seconds}"])
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        outcome = Supervisor(
+            plan,
+            Path(folder),
+            run=f"bench-{time.monotonic_ns():x}",
+            virtual=True,
+            can_url=resolve_url("auto") if can else "",
+            scenario_toml=effective_toml(scenario),
+            recorded=recorded,
+        ).run()
+    if outcome.failure:
+        raise RuntimeError(outcome.failure)
+    ticks = plan.duration_ns / plan.robots[0].period_ns
+    robots = {robot.name for robot in plan.robots}
+    memory = max(result.resident_bytes for result in outcome.results if result.name in robots)
+    return ticks / outcome.wall_s, outcome.startup_s, memory / 1e6
+
+
+def lab_in_process(*, whole: bool) -> float:
+    """Runs lab.toml in this process; returns how many times faster than real time.
+
+    `whole`: with recording and frames on a virtual bus; otherwise roles and links alone."""
+    scenario, plan = load(SCENARIOS / "lab.toml")
+    if whole:
+        with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+            display = Display(plan, quiet=True)
+            done = execute(
+                scenario, plan, Path(folder), engine="inprocess", clock="virtual", can_url="virtual", display=display
+            )
+        return float(done.summary["run"]["real_time_factor"])
+    engine = Engine(plan)
+    begun_s = time.perf_counter()
+    engine.run()
+    return plan.duration_ns / 1e9 / (time.perf_counter() - begun_s)
+
+
+def measure(repeats: int, seconds: float) -> list[Row]:
+    """Measures everything, the kinds of run in turn."""
+    full, bare, startups, memories, alone, whole = [], [], [], [], [], []
+    for _ in range(repeats):
+        rate, startup, memory = paper_processes(seconds, recorded=True, can=True)
+        full.append(rate)
+        startups.append(startup)
+        memories.append(memory)
+        bare.append(paper_processes(seconds, recorded=False, can=False)[0])
+        alone.append(lab_in_process(whole=False))
+        whole.append(lab_in_process(whole=True))
+    return [
+        Row("paper.toml as processes: laws, recorder, CAN", "ticks/s", tuple(full)),
+        Row("paper.toml as processes: laws alone", "ticks/s", tuple(bare)),
+        Row("lab.toml in one process: roles and links", "× real time", tuple(alone)),
+        Row("lab.toml in one process: with recording and CAN", "× real time", tuple(whole)),
+        Row("start-up of 15 processes", "s", tuple(startups)),
+        Row("resident memory of a robot process, largest", "MB", tuple(memories)),
+    ]
+
+
+def table(rows: list[Row]) -> str:
+    """Lays out medians, smallest and largest."""
+    lines = [f"{'':52} {'median':>9} {'min':>9} {'max':>9}"]
+    lines += [
+        f"{f'{row.what} [{row.unit}]':52.64} {row.median:9.4g} {min(row.values):9.4g} {max(row.values):9.4g}" for row in rows
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,212 @@
+"""The exchange every peer performs: nine robots, three leaders, one coordinator, a process each, in lockstep.
+
+A tick: robots send their state to their leader, leaders their group's state to the coordinator; the coordinator sends
+one reference to the leaders, each leader one command to its robots. That is 16 messages and 24 deliveries. What is sent
+depends on all that was received, so the final values show that nobody left anything out.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import resource
+import signal
+import struct
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Final, Protocol
+
+GROUPS: Final = 3
+ROBOTS: Final = 3
+"""Robots in each group."""
+HEADER: Final = struct.Struct("<HHIQq")
+"""Schema version, channel, source, sequence, time [ns]."""
+CHANNELS: Final = ("state", "group", "reference", "command")
+FIELDS: Final = {"state": 10, "group": 30, "reference": 60, "command": 24}
+"""Number of float64 in a message of each channel."""
+_BODY: Final = {channel: struct.Struct(f"<{number}d") for channel, number in FIELDS.items()}
+_DOUBLE: Final = struct.Struct("<d")
+START_TIMEOUT_S: Final = 30.0
+RUN_TIMEOUT_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """One process: a robot (group, number), a leader (group, None) or the coordinator (None, None)."""
+
+    group: int | None = None
+    number: int | None = None
+
+    @property
+    def name(self) -> str:
+        """`coordinator`, `g1` or `g1r2`."""
+        if self.group is None:
+            return "coordinator"
+        return f"g{self.group}" if self.number is None else f"g{self.group}r{self.number}"
+
+    @property
+    def source(self) -> int:
+        """A number of its own for the header."""
+        if self.group is None:
+            return 200
+        return 100 + self.group if self.number is None else self.group * ROBOTS + self.number
+
+
+COORDINATOR: Final = Role()
+LEADERS: Final = tuple(Role(group) for group in range(GROUPS))
+ROLES: Final = (
+    COORDINATOR,
+    *LEADERS,
+    *(Role(group, number) for group in range(GROUPS) for number in range(ROBOTS)),
+)
+
+
+class Ports(Protocol):
+    """How a role reaches the others: all that differs between the peers."""
+
+    def send(self, channel: str, payload: bytes) -> None:
+        """Send to every receiver of the channel."""
+
+    def receive(self, channel: str) -> Sequence[bytes]:
+        """Wait for this tick's message from each sender of the channel."""
+
+
+def pack(channel: str, source: int, tick: int, value: float) -> bytes:
+    """Return a message whose fields are all `value`."""
+    head = HEADER.pack(1, CHANNELS.index(channel), source, tick, tick * 10_000_000)
+    return head + _BODY[channel].pack(*[value] * FIELDS[channel])
+
+
+def unpack(payload: bytes, tick: int) -> float:
+    """Return the value of a message of this tick, read from its first and last field."""
+    if HEADER.unpack_from(payload)[3] != tick:
+        raise ValueError(f"a message of tick {HEADER.unpack_from(payload)[3]} came in tick {tick}")
+    first: float = _DOUBLE.unpack_from(payload, HEADER.size)[0]
+    last: float = _DOUBLE.unpack_from(payload, len(payload) - 8)[0]
+    return (first + last) / 2
+
+
+def robot_start(role: Role) -> float:
+    """Return a robot's first state."""
+    return 1.0 + role.source
+
+
+def robot_law(state: float, command: float) -> float:
+    """Return the next state."""
+    return 0.5 * state + command
+
+
+def sum_law(values: Sequence[float]) -> float:
+    """Return what a leader or the coordinator makes of its children's values, whatever their order."""
+    return sum(sorted(values))
+
+
+def command_law(reference: float, group: int) -> float:
+    """Return a leader's command."""
+    return 0.001 * reference + group
+
+
+def play(role: Role, ports: Ports, ticks: int) -> float:
+    """Run a role for a number of ticks; return its last value."""
+    send, receive, source = ports.send, ports.receive, role.source
+    value = robot_start(role)
+    for tick in range(ticks):
+        if role.number is not None:
+            send("state", pack("state", source, tick, value))
+            value = robot_law(value, *[unpack(payload, tick) for payload in receive("command")])
+        elif role.group is not None:
+            value = sum_law([unpack(payload, tick) for payload in receive("state")])
+            send("group", pack("group", source, tick, value))
+            (reference,) = [unpack(payload, tick) for payload in receive("reference")]
+            send("command", pack("command", source, tick, command_law(reference, role.group)))
+        else:
+            value = sum_law([unpack(payload, tick) for payload in receive("group")])
+            send("reference", pack("reference", source, tick, value))
+    return value
+
+
+class Meter:
+    """What a process used between `start` and `report`."""
+
+    def start(self) -> None:
+        """Begin."""
+        gc.collect()
+        gc.freeze()
+        self._before = resource.getrusage(resource.RUSAGE_SELF)
+        self._start = time.monotonic()
+
+    def report(self, folder: Path, name: str, value: float | None) -> None:
+        """Write what was used since `start` to `folder`; processes that only serve have no value."""
+        end, after, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF), self._before
+        found = {
+            "value": value,
+            "start": self._start,
+            "end": end,
+            "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+            "switches": after.ru_nvcsw + after.ru_nivcsw - before.ru_nvcsw - before.ru_nivcsw,
+        }
+        (folder / f"{name}.json").write_text(json.dumps(found))
+
+
+def die_with_parent() -> None:
+    """Let the kernel end this process when the one that started it ends."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.getppid() == 1:
+        os._exit(1)
+
+
+Connect = Callable[[Role, Path], "Iterator[Ports]"]
+"""Yields a role's ports when they are ready for the first message; resumed after the last."""
+
+
+def run_roles(connect: Connect, ticks: int, folder: Path) -> None:
+    """Run every role in a forked process, meeting before the first tick and after the last."""
+    context = multiprocessing.get_context("fork")
+    barrier = context.Barrier(len(ROLES))
+    children = [
+        context.Process(target=_child, args=(connect, role, ticks, folder, barrier), daemon=True) for role in ROLES
+    ]
+    run_processes(children)
+
+
+def run_processes(children: Sequence[multiprocessing.process.BaseProcess]) -> None:
+    """Start processes and wait for all; when one fails, end the others."""
+    try:
+        for child in children:
+            child.start()
+        waiting = list(children)
+        deadline = time.monotonic() + RUN_TIMEOUT_S
+        while waiting:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise RuntimeError(f"{', '.join(child.name for child in waiting)} did not end in {RUN_TIMEOUT_S:.0f} s")
+            multiprocessing.connection.wait([child.sentinel for child in waiting], left)
+            for child in [child for child in waiting if child.exitcode is not None]:
+                if child.exitcode:
+                    raise RuntimeError(f"process {child.name} ended with {child.exitcode}")
+                waiting.remove(child)
+    finally:
+        for child in children:
+            if child.pid is not None and child.is_alive():
+                child.kill()
+            if child.pid is not None:
+                child.join()
+
+
+def _child(connect: Connect, role: Role, ticks: int, folder: Path, barrier: Barrier) -> None:
+    die_with_parent()
+    with contextmanager(connect)(role, folder) as ports:
+        meter = Meter()
+        barrier.wait(START_TIMEOUT_S)
+        meter.start()
+        value = play(role, ports, ticks)
+        meter.report(folder, role.name, value)
+        barrier.wait(START_TIMEOUT_S)

@@ -1,0 +1,297 @@
+"""The session: payloads arrive whole and in order, tokens tell who is there, nobody waits for whom it should not."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+from echelon.session import MAX_PAYLOAD, Inbox, Session, loopback_endpoints
+
+TIMEOUT_S = 10.0
+_spawn = multiprocessing.get_context("spawn")
+Body = Callable[[str, Connection], None]
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as found:
+        yield found
+
+
+def pair(stack: ExitStack, *, lockstep: bool = True, endpoint: str | None = None) -> tuple[Session, Session]:
+    """Return two sessions linked to each other; the first listens."""
+    endpoints = [endpoint] if endpoint else loopback_endpoints(1)
+    first = stack.enter_context(Session(listen=endpoints, connect=[], lockstep=lockstep))
+    second = stack.enter_context(Session(listen=[], connect=endpoints, lockstep=lockstep))
+    return first, second
+
+
+def ready(receiver: Session, sender: Session) -> None:
+    """Wait until the sender knows all that the receiver has declared."""
+    receiver.declare_token("run/@alive/receiver")
+    assert sender.await_tokens(["run/@alive/receiver"], TIMEOUT_S) == set()
+
+
+def child(stack: ExitStack, body: Body, endpoint: str) -> tuple[multiprocessing.process.BaseProcess, Connection]:
+    """Start another process at the other end; it lives no longer than the test."""
+    here, there = _spawn.Pipe()
+    process = _spawn.Process(target=body, args=(endpoint, there), daemon=True)
+    process.start()
+
+    def end() -> None:
+        process.kill()
+        process.join()
+
+    stack.callback(end)
+    return process, here
+
+
+def hears(connection: Connection) -> object:
+    """Return what a child says."""
+    assert connection.poll(TIMEOUT_S), "the other process says nothing"
+    return connection.recv()
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+@pytest.mark.parametrize("transport", ["tcp", "unix"])
+def test_payloads_arrive_whole_and_in_order(stack: ExitStack, tmp_path: Path, lockstep: bool, transport: str) -> None:
+    endpoint = f"unixsock-stream/{tmp_path}/s" if transport == "unix" else None
+    first, second = pair(stack, lockstep=lockstep, endpoint=endpoint)
+    inbox = first.subscribe("run/g1/r1/state")
+    ready(first, second)
+    publisher = second.publisher("run/g1/r1/state")
+    sent = [bytes([number]) * (number + 1) for number in range(200)]
+    for payload in sent:
+        publisher.put(payload)
+    assert inbox.take(len(sent), TIMEOUT_S) == sent
+    assert inbox.take(0) == []
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_take_waits_for_each_key(stack: ExitStack, lockstep: bool) -> None:
+    first, second = pair(stack, lockstep=lockstep)
+    keys = [f"run/r{number}/state" for number in range(3)]
+    inbox = first.subscribe([*keys, "run/reference"])
+    ready(first, second)
+    publishers = [second.publisher(key) for key in keys]
+    for publisher, payload in zip(publishers, (b"0", b"1", b"2"), strict=True):
+        publisher.put(payload)
+    assert sorted(inbox.take(keys=keys, timeout_s=TIMEOUT_S)) == [b"0", b"1", b"2"]
+    publishers[0].put(b"a")
+    publishers[0].put(b"b")
+    assert inbox.take(2, TIMEOUT_S) == [b"a", b"b"]
+    publishers[1].put(b"c")
+    assert inbox.take(1, TIMEOUT_S) == [b"c"]
+    # The others do not count for a key that is silent; what they brought is returned at the timeout.
+    publishers[2].put(b"d")
+    before = time.monotonic()
+    assert inbox.take(keys=keys[:2], timeout_s=0.05) == [b"d"]
+    assert time.monotonic() - before >= 0.05
+    assert inbox.take(keys=["run/reference"], timeout_s=0.01) == []
+
+
+def test_wake_ends_a_wait(stack: ExitStack) -> None:
+    session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
+    inbox = session.subscribe("run/state")
+    inbox.wake()  # before: kept for the next wait
+    assert inbox.take() == []
+    timer = threading.Timer(0.01, inbox.wake)
+    timer.start()
+    assert inbox.take() == []
+    timer.join()
+
+
+def test_a_session_hears_itself(stack: ExitStack) -> None:
+    session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
+    inbox = session.subscribe("run/**")
+    session.publisher("run/state").put(b"x")
+    assert inbox.take(1, TIMEOUT_S) == [b"x"]
+
+
+@pytest.mark.parametrize("size", [0, MAX_PAYLOAD + 1])
+def test_a_payload_of_a_wrong_size_is_refused(stack: ExitStack, size: int) -> None:
+    session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
+    with pytest.raises(ValueError, match=rf"not {size}$"):
+        session.publisher("run/state").put(bytes(size))
+
+
+def test_the_longest_payload_arrives(stack: ExitStack) -> None:
+    first, second = pair(stack)
+    inbox = first.subscribe("run/state")
+    ready(first, second)
+    second.publisher("run/state").put(bytes(MAX_PAYLOAD))
+    assert inbox.take(1, TIMEOUT_S) == [bytes(MAX_PAYLOAD)]
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "carrier-pigeon/loft:1",
+        "tcp/localhost",
+        "tcp/localhost:http",
+        "tcp/localhost:99999",
+        "unixsock-stream/",
+        "unixsock-stream//tmp/" + "x" * 103,
+        "unixsock-stream//does/not/exist/s",
+        "",
+    ],
+)
+def test_a_bad_endpoint_is_named(endpoint: str) -> None:
+    with pytest.raises(ValueError, match="endpoint|cannot listen") as caught:
+        Session(listen=[endpoint], connect=[], lockstep=True)
+    assert endpoint in str(caught.value)
+
+
+def test_an_endpoint_in_use_is_named(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=True))
+    with pytest.raises(ValueError, match=endpoint.replace(".", r"\.")):
+        Session(listen=[endpoint], connect=[], lockstep=True)
+
+
+def test_missing_tokens_are_named(stack: ExitStack) -> None:
+    first, second = pair(stack)
+    first.declare_token("run/@alive/1/robot/a/77")
+    wanted = ["run/@alive/1/robot/a/*", "run/@alive/1/robot/b/*"]
+    assert second.await_tokens(wanted[:1], TIMEOUT_S) == set()
+    assert second.await_tokens(wanted, 0.05) == {"run/@alive/1/robot/b/*"}
+
+
+def _listen_late(endpoint: str, parent: Connection) -> None:
+    with Session(listen=[endpoint], connect=[], lockstep=True) as session:
+        inbox = session.subscribe("run/state")
+        session.declare_token("run/@alive/late")
+        parent.send(inbox.take(100, TIMEOUT_S))
+
+
+def test_whoever_connects_first_loses_nothing_after_the_barrier(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    session = stack.enter_context(Session(listen=[], connect=[endpoint], lockstep=True))
+    _, parent = child(stack, _listen_late, endpoint)
+    assert session.await_tokens(["run/@alive/late"], TIMEOUT_S) == set()
+    publisher = session.publisher("run/state")
+    sent = [b"%d" % number for number in range(100)]
+    for payload in sent:
+        publisher.put(payload)
+    assert hears(parent) == sent
+
+
+def _put_and_close(endpoint: str, parent: Connection) -> None:
+    with Session(listen=[], connect=[endpoint], lockstep=True) as session:
+        assert session.await_tokens(["run/@alive/receiver"], TIMEOUT_S) == set()
+        publisher = session.publisher("run/state")
+        for number in range(100):
+            publisher.put(b"%d" % number)
+
+
+def test_close_delivers_what_was_put_last(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=True))
+    inbox = session.subscribe("run/state")
+    session.declare_token("run/@alive/receiver")
+    process, _ = child(stack, _put_and_close, endpoint)
+    assert inbox.take(100, TIMEOUT_S) == [b"%d" % number for number in range(100)]
+    process.join(TIMEOUT_S)
+    assert process.exitcode == 0
+
+
+def _be_there(endpoint: str, parent: Connection) -> None:
+    with Session(listen=[], connect=[endpoint], lockstep=True) as session:
+        session.declare_token("run/@alive/victim")
+        parent.recv()
+
+
+def test_the_token_of_a_killed_process_is_lost(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=True))
+    lost: list[str] = []
+    inbox = session.subscribe("run/state")
+
+    def on_lost(key: str) -> None:
+        lost.append(key)
+        inbox.wake()
+
+    tokens = session.watch_tokens("run/@alive/**", on_lost)
+    process, _ = child(stack, _be_there, endpoint)
+    assert tokens.wait(["run/@alive/victim"], TIMEOUT_S) == set()
+    assert tokens.alive() == {"run/@alive/victim"}
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    assert inbox.take(timeout_s=TIMEOUT_S) == []
+    assert lost == ["run/@alive/victim"]
+    assert tokens.alive() == frozenset()
+
+
+def _flood(endpoint: str, parent: Connection) -> None:
+    with Session(listen=[], connect=[endpoint], lockstep=True) as session:
+        assert session.await_tokens(["run/@alive/receiver"], TIMEOUT_S) == set()
+        publisher = session.publisher("run/state")
+        for number in range(1000):
+            parent.send(number)  # about to put
+            publisher.put(number.to_bytes(4, "little") + bytes(40_000))
+        parent.send(None)
+
+
+def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=True))
+    inbox = session.subscribe("run/state", backpressure=True, high_water=8)
+    session.declare_token("run/@alive/receiver")
+    _, parent = child(stack, _flood, endpoint)
+    begun = -1
+    while parent.poll(0.3 if begun > 50 else TIMEOUT_S):  # until the sender stands still
+        found = parent.recv()
+        assert found is not None, "nothing held the sender back"
+        begun = found
+    assert begun < 900  # 40 kB each: what the sockets of both ends hold, and the inbox its 8
+    numbers: list[int] = []
+    while len(numbers) < 1000:
+        while parent.poll():
+            parent.recv()  # or its words would fill the pipe
+        payloads = inbox.take(1, TIMEOUT_S)
+        assert 0 < len(payloads) <= 2 * 8 + 1
+        numbers += [int.from_bytes(payload[:4], "little") for payload in payloads]
+    assert numbers == list(range(1000))
+
+
+def test_on_the_wall_clock_the_newest_are_kept(stack: ExitStack) -> None:
+    session = stack.enter_context(Session(listen=[], connect=[], lockstep=False))
+    inbox: Inbox = session.subscribe("run/state", high_water=4)
+    publisher = session.publisher("run/state")
+    for number in range(100):
+        publisher.put(b"%d" % number)
+    assert inbox.take(4, TIMEOUT_S) == [b"96", b"97", b"98", b"99"]
+
+
+def _stop_there(endpoint: str, parent: Connection) -> None:
+    with Session(listen=[], connect=[endpoint], lockstep=False) as session:
+        session.subscribe("run/state")
+        session.declare_token("run/@alive/stopped")
+        parent.recv()
+
+
+def test_on_the_wall_clock_a_stopped_peer_blocks_no_put(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=False))
+    inbox = session.subscribe("run/state")
+    process, _ = child(stack, _stop_there, endpoint)
+    assert session.await_tokens(["run/@alive/stopped"], TIMEOUT_S) == set()
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGSTOP)
+    publisher = session.publisher("run/state")
+    longest = 0.0
+    for _ in range(500):  # 20 MB: more than the sockets hold
+        before = time.monotonic()
+        publisher.put(bytes(40_000))
+        longest = max(longest, time.monotonic() - before)
+    assert longest < 0.5
+    assert inbox.take(1, TIMEOUT_S)

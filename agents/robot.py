@@ -5,11 +5,11 @@ one message, where a separate one for torque would cost every delivery twice.
 """
 
 from collections.abc import Sequence
-from math import cos, nan, sin
+from math import nan
 
 import numpy as np
 
-from agents.plant import LOST, RobotState, make_step
+from agents.plant import LOST, make_step, state_at
 from agents.torque import TorqueLimits, make_inverse
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import Plan
@@ -32,7 +32,7 @@ class Robot:
         self._inner = robot.period_ns // robot.torque_period_ns
         self._h = robot.torque_period_ns * 1e-9
         self._at = 2 * robot.child_number
-        self.state = RobotState(*robot.start, robot.heading, 0.0, 0.0)
+        self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
         self._did = (0.0,) * 9
         deepest = max(node.depth for node in plan.nodes)
         self.stages = (
@@ -42,8 +42,8 @@ class Robot:
 
     def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Returns the state at `time_ns`."""
-        x, y, theta, v, omega = self.state.x, self.state.y, self.state.theta, self.state.v, self.state.omega
-        c, s, across = cos(theta), sin(theta), self._plan.offset * omega
+        x, y, theta, v, omega, c, s = self.state
+        across = self._plan.offset * omega
         values = np.array((x, y, v * c - across * s, v * s + across * c, theta, v, omega, *self._did))
         return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
 

@@ -31,8 +31,7 @@ def make_inverse(robot: RobotPlan) -> Inverse:
     half_difference = (robot.inertia - m * d * d) * r / (d * arm) / 2
 
     def inverse(state: RobotState, ax: float, ay: float, lead: float) -> tuple[float, float]:
-        theta, v, omega = state.theta, state.v, state.omega
-        c, s = cos(theta), sin(theta)
+        _, _, theta, v, omega, c, s = state
         v_dot = c * ax + s * ay + d * omega * omega
         omega_dot = (c * ay - s * ax - v * omega) / d
         theta += lead * (omega + 0.5 * lead * omega_dot)

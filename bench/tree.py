@@ -17,7 +17,7 @@ import resource
 import signal
 import struct
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.synchronize import Barrier
@@ -69,14 +69,36 @@ ROLES: Final = (
 )
 
 
+Play = Generator[str, Sequence[bytes], float]
+"""A role at work: it yields the channel it waits for, is sent this tick's message of each sender, returns its last value."""
+
+
 class Ports(Protocol):
     """How a role reaches the others: all that differs between the peers."""
 
     def send(self, channel: str, payload: bytes) -> None:
         """Send to every receiver of the channel."""
 
+    def drive(self, play: Play) -> float:
+        """Run a role to its end."""
+
+
+class BlockingPorts:
+    """Ports whose `receive` waits for this tick's message from each sender of a channel."""
+
     def receive(self, channel: str) -> Sequence[bytes]:
         """Wait for this tick's message from each sender of the channel."""
+        raise NotImplementedError
+
+    def drive(self, play: Play) -> float:
+        """Run a role to its end."""
+        try:
+            channel = next(play)
+            while True:
+                channel = play.send(self.receive(channel))
+        except StopIteration as end:
+            value: float = end.value
+            return value
 
 
 def pack(channel: str, source: int, tick: int, value: float) -> bytes:
@@ -114,21 +136,21 @@ def command_law(reference: float, group: int) -> float:
     return 0.001 * reference + group
 
 
-def play(role: Role, ports: Ports, ticks: int) -> float:
-    """Run a role for a number of ticks; return its last value."""
-    send, receive, source = ports.send, ports.receive, role.source
+def play(role: Role, send: Callable[[str, bytes], None], ticks: int) -> Play:
+    """Run a role for a number of ticks."""
+    source = role.source
     value = robot_start(role)
     for tick in range(ticks):
         if role.number is not None:
             send("state", pack("state", source, tick, value))
-            value = robot_law(value, *[unpack(payload, tick) for payload in receive("command")])
+            value = robot_law(value, *[unpack(payload, tick) for payload in (yield "command")])
         elif role.group is not None:
-            value = sum_law([unpack(payload, tick) for payload in receive("state")])
+            value = sum_law([unpack(payload, tick) for payload in (yield "state")])
             send("group", pack("group", source, tick, value))
-            (reference,) = [unpack(payload, tick) for payload in receive("reference")]
+            (reference,) = [unpack(payload, tick) for payload in (yield "reference")]
             send("command", pack("command", source, tick, command_law(reference, role.group)))
         else:
-            value = sum_law([unpack(payload, tick) for payload in receive("group")])
+            value = sum_law([unpack(payload, tick) for payload in (yield "group")])
             send("reference", pack("reference", source, tick, value))
     return value
 
@@ -207,6 +229,6 @@ def _child(connect: Connect, role: Role, ticks: int, folder: Path, barrier: Barr
         meter = Meter()
         barrier.wait(START_TIMEOUT_S)
         meter.start()
-        value = play(role, ports, ticks)
+        value = ports.drive(play(role, ports.send, ticks))
         meter.report(folder, role.name, value)
         barrier.wait(START_TIMEOUT_S)

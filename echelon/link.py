@@ -1,8 +1,8 @@
 """The link model: which message a receiver may use at a given instant.
 
-Every directed pair (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is lost,
-and how long it takes, is a pure function of (scenario seed, link, k): the same messages are lost in every engine, at
-every speed and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key names the
+Every directed pair (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is
+lost, and how long it takes, is a pure function of (scenario seed, link, k): the same messages are lost in every engine,
+at every speed and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key names the
 link, the counter the message, so any draw can be made without the ones before it.
 
 A message is used at the first tick at or after its arrival, and the newest that has arrived is the one in use
@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.random import Philox
 
-from echelon.messages import Channel
+from echelon.messages import Channel, Values
 from echelon.plan import LinkPlan
 
 _BLOCK: Final = 512
@@ -30,16 +30,17 @@ def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
     return int.from_bytes(hashlib.blake2b(name, digest_size=16).digest(), "little")
 
 
-def draws(key: int, block: int) -> np.ndarray:
-    """Returns uniform numbers in [0, 1), shape (_BLOCK, 2): for each message of the block its loss and its delay draw."""
+def draws(key: int, block: int) -> Values:
+    """Returns numbers uniform in [0, 1), shape (_BLOCK, 2): the loss and the delay draw of each message of a block."""
     words = Philox(key=key, counter=block * (_BLOCK // 2)).random_raw(2 * _BLOCK)
-    return ((words >> np.uint64(11)) * 2.0**-53).reshape(_BLOCK, 2)
+    uniform: Values = np.multiply(words >> np.uint64(11), 2.0**-53)
+    return uniform.reshape(_BLOCK, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class LinkCounts:
     """What became of a link's messages; sent = delivered + lost + in flight.  Ages [ns] are of what was in use, at each
-    use; `held` counts the uses of a message that had been used before."""
+    use; `held` counts the uses of a message, after the instant it was sent in, that had been used before."""
 
     source: int
     receiver: int
@@ -98,6 +99,11 @@ class Link:
         if loss < plan.loss:
             return None
         return plan.delay_min_ns + round(delay * (plan.delay_max_ns - plan.delay_min_ns))
+
+    def arrived(self, sequence: int, time_ns: int) -> bool:
+        """True if message number `sequence` is not lost and has arrived by `time_ns`."""
+        delay = self.fate(sequence)
+        return delay is not None and sequence * self.plan.period_ns + delay <= time_ns
 
     def newest(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""

@@ -6,22 +6,29 @@ that runs has heard the same whatever the order, the speed or the process in whi
 """
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from echelon.link import Link, LinkCounts
 from echelon.messages import Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Role
 
+SLACK: Final = 64
+"""Messages that an input may hold beyond those in flight before it looks for lost ones among them."""
+
 
 @dataclass(slots=True)
 class _Slot:
-    """One input: its link, the message in use, and those that came early, by number."""
+    """One input: its link, the message in use with its number, and the newer ones that have come, by number."""
 
     link: Link
     ideal: bool
     period_ns: int
+    many: int
+    """More messages than this cannot all be in flight: those that the link loses are then forgotten."""
     current: Message | None = None
-    early: dict[int, Message] = field(default_factory=dict)
+    in_use: int = -1
+    newer: dict[int, Message] = field(default_factory=dict)
     wanted: int = -1
 
 
@@ -33,7 +40,10 @@ class Mailbox:
         receiver = members[role.index].name
         self._slots = {
             (link.channel, link.source): _Slot(
-                Link(link, plan.seed, members[link.source].name, receiver), link.ideal, link.period_ns
+                Link(link, plan.seed, members[link.source].name, receiver),
+                link.ideal,
+                link.period_ns,
+                2 * (link.delay_max_ns // link.period_ns) + SLACK,
             )
             for link in plan.links_into(role.index)
         }
@@ -49,15 +59,15 @@ class Mailbox:
         slot = self._slots.get((message.channel, message.source))
         if slot is None:
             self.unexpected += 1
-        elif message.sequence >= slot.wanted:
-            slot.early[message.sequence] = message
+        elif message.sequence > slot.in_use:
+            slot.newer[message.sequence] = message
 
     def missing(self, stage: int, time_ns: int) -> list[Link]:
         """Returns the links whose message in use at `time_ns` has not come; empty if the stage can run."""
         waiting = []
         for slot in self._stage_slots[stage]:
-            slot.wanted = number = slot.link.newest(time_ns)
-            if number >= 0 and number not in slot.early and (slot.current is None or slot.current.sequence != number):
+            slot.wanted = number = time_ns // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
+            if number > slot.in_use and number not in slot.newer:
                 waiting.append(slot.link)
         return waiting
 
@@ -69,15 +79,19 @@ class Mailbox:
         """
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
-            early, current = slot.early, slot.current
-            number = slot.wanted = time_ns // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
-            if early:
-                message = early.pop(number, None)
+            newer = slot.newer
+            slot.wanted = number = time_ns // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
+            if newer:
+                if number not in newer and number > slot.in_use:
+                    number = self._newest_come(slot, time_ns)
+                message = newer.pop(number, None)
                 if message is not None:
-                    slot.current = current = message
-                if early:
-                    self._catch_up(slot, number)
-                    current = slot.current
+                    slot.current, slot.in_use = message, number
+                    if newer:
+                        slot.newer = {sequence: newer[sequence] for sequence in newer if sequence > number}
+                elif len(newer) > slot.many:
+                    slot.newer = {each: newer[each] for each in newer if slot.link.fate(each) is not None}
+            current = slot.current
             if current is None or not current.values.size:
                 heard.append(None)
             else:
@@ -86,12 +100,9 @@ class Mailbox:
         return heard
 
     @staticmethod
-    def _catch_up(slot: _Slot, number: int) -> None:
-        """Takes the newest of the messages up to `number`, and forgets the older ones: no stage will want them."""
-        for sequence in [sequence for sequence in slot.early if sequence <= number]:
-            message = slot.early.pop(sequence)
-            if (slot.current is None or sequence > slot.current.sequence) and slot.link.fate(sequence) is not None:
-                slot.current = message
+    def _newest_come(slot: _Slot, time_ns: int) -> int:
+        """Returns the number of the newest message that has come and that the link lets arrive by now, or -1."""
+        return max((number for number in slot.newer if slot.link.arrived(number, time_ns)), default=-1)
 
     def counts(self) -> list[LinkCounts]:
         """Returns the counts of every link into this role."""

@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 COORDINATOR = "coordinator"
 
 
+class PlanError(Exception):
+    """A scenario whose values do not fit together; the text begins with the key."""
+
+
 @dataclass(frozen=True, slots=True)
 class RobotPlan:
     """A robot: its place in the tree and its parameters (theory.md section 1), SI units."""
@@ -43,6 +47,11 @@ class RobotPlan:
     def name(self) -> str:
         """What people call it: its path."""
         return self.path
+
+    @property
+    def role(self) -> str:
+        """`robot`"""
+        return "robot"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +131,7 @@ class AvoidancePlan:
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """A directed link, applied where it ends: delay between two bounds [ns], i.i.d. loss, policy for a missing input."""
+    """A directed link, applied where it ends: bounds of its delay [ns], i.i.d. loss, policy for a missing input."""
 
     source: int
     receiver: int

@@ -1,10 +1,14 @@
 """Runs one role over a session: in lockstep (virtual time), or paced by a clock (wall time).
 
-The loop is the same: for every instant, for every stage that is due, wait for what the mailbox misses, run the stage,
-put what it returns.  In a lockstep it waits as long as it takes and says whom it waits for; on a wall clock it waits
-until the stage's deadline, counts what was late, and goes on with the newest it has.
+In a lockstep the role moves as messages come: the handler of a message puts it into the mailbox and runs every stage that
+misses nothing any more, in Zenoh's own thread.  Between messages the process sleeps.  The main thread wakes only for what
+may wait for others: sending batches to those who watch, and long stretches without waiting.
+
+On a wall clock the main thread waits for each stage's inputs until the stage's deadline, counts what was late, and goes on
+with the newest it has.
 """
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,16 +16,20 @@ from math import gcd
 from typing import Final
 
 from echelon.mailbox import Mailbox
-from echelon.messages import Channel, Message
+from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.role import Role, Stage
 from echelon.session import Inbox, Publisher, Session
 from echelon.wire import WireError, data_key, decode, encode, join, watch_key
 
 STALL_S: Final = 1.0
-"""A lockstep that has waited this long for one message says so, and goes on waiting."""
+"""A lockstep that has not moved for so long says whom it waits for, and goes on waiting."""
 BATCH_BYTES: Final = 12_000
-"""Watchers get messages in batches of about this size in virtual time: far fewer deliveries, far under the limit."""
+"""Watchers get messages in batches of about this size in virtual time: far fewer deliveries."""
+MAX_BATCHES: Final = 4
+"""So many batches may wait for a slow watcher before the role waits, too."""
+STRETCH: Final = 64
+"""Stages run in Zenoh's thread without a pause; what goes on for longer is the main thread's, where a put may wait."""
 
 OnWait = Callable[[int, list[int]], None]
 """(instant [ns], indices of the members waited for)"""
@@ -42,26 +50,35 @@ class RunnerCounts:
 
 
 class Watch:
-    """Sends copies of a member's messages to those who watch the run, in batches."""
+    """Gathers copies of a member's messages into batches, for those who watch the run."""
 
     def __init__(self, publisher: Publisher, limit: int) -> None:
-        self._publisher, self._limit = publisher, limit
+        self._put, self._limit = publisher.put, limit
         self._payloads: list[bytes] = []
         self._size = 0
+        self.batches: list[bytes] = []
+        """Batches to be sent."""
 
-    def add(self, payload: bytes) -> None:
-        """Takes one message; sends the batch if it is full."""
+    def add(self, payload: bytes) -> bool:
+        """Takes one message; returns True if that completes a batch."""
         self._payloads.append(payload)
         self._size += len(payload)
-        if self._size >= self._limit:
-            self.flush()
+        return self._size >= self._limit and self.close()
 
-    def flush(self) -> None:
-        """Sends what has gathered."""
-        if self._payloads:
-            self._publisher.put(join(self._payloads))
-            self._payloads.clear()
-            self._size = 0
+    def close(self) -> bool:
+        """Ends the batch in progress; returns True if there was something in it."""
+        if not self._payloads:
+            return False
+        self.batches.append(join(self._payloads))
+        self._payloads.clear()
+        self._size = 0
+        return True
+
+    def send(self) -> None:
+        """Sends all complete batches; waits for watchers that are behind."""
+        while self.batches:
+            self._put(self.batches[0])
+            del self.batches[0]
 
 
 class Runner:
@@ -69,90 +86,151 @@ class Runner:
 
     def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool, virtual: bool) -> None:
         members = plan.members
+        member = members[role.index]
         self.role, self.plan = role, plan
         self.mailbox = Mailbox(role, plan)
         self.counts = RunnerCounts()
-        inputs = {slot_input for stage in role.stages for slot_input in stage.inputs}
-        keys = sorted(data_key(run, members[one.source].path, one.channel) for one in inputs)
-        self._inbox: Inbox = session.subscribe(keys)
         channels = sorted({link.channel for link in plan.links if link.source == role.index})
-        path = members[role.index].path
-        self._publishers: dict[Channel, Publisher] = {
-            channel: session.publisher(data_key(run, path, channel)) for channel in channels
-        }
+        self._puts = {channel: session.publisher(data_key(run, member.path, channel)).put for channel in channels}
         self._watch: Watch | None = None
         if watched:
-            key = watch_key(run, members[role.index].name)
-            self._watch = Watch(session.publisher(key), BATCH_BYTES if virtual else 0)
+            watch = session.publisher(watch_key(run, member.role, member.name))
+            self._watch = Watch(watch, BATCH_BYTES if virtual else 0)
         self._tick_ns = gcd(*[stage.period_ns for stage in role.stages])
+        self._stages = list(enumerate(role.stages))
+
+        # State of a lockstep.  Whoever holds the lock may touch the mailbox and move the role.
+        self._lock = threading.Lock()
+        self._wake = threading.Event()  # there is something for the main thread
+        self._in_handler = False  # the handler may move the role; otherwise that is the main thread's turn
+        self._time_ns = 0
+        self._at = 0
+        self._moved = 0
+        self._finished = False
+        self._failure: BaseException | None = None
+
+        inputs = {slot_input for stage in role.stages for slot_input in stage.inputs}
+        keys = sorted(data_key(run, members[one.source].path, one.channel) for one in inputs)
+        self._inbox: Inbox | None = None
+        if virtual:
+            session.subscribe(keys, self._receive)
+        else:
+            self._inbox = session.inbox(keys)
 
     def lockstep(self, on_wait: OnWait) -> None:
         """Runs the plan in virtual time, as fast as messages come; `on_wait` is told of every wait beyond `STALL_S`."""
-        mailbox, inbox = self.mailbox, self._inbox
-        stages = list(enumerate(self.role.stages))
-        for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
-            for number, stage in stages:
-                if time_ns % stage.period_ns:
-                    continue
-                while missing := mailbox.missing(number, time_ns):
-                    payloads = inbox.take(len(missing), STALL_S)
-                    self._deliver(payloads)
-                    if not payloads:
-                        self.flush()
-                        on_wait(time_ns, [link.plan.source for link in missing])
-                self._run_stage(number, stage, time_ns)
-        self.flush()
+        last_moved = -1
+        while True:
+            with self._lock:
+                self._in_handler = not self._advance()
+            if self._failure is not None:
+                raise self._failure
+            if self._watch is not None:
+                self._watch.send()
+            if self._finished:
+                return
+            if self._in_handler and not self._wake.wait(STALL_S):
+                with self._lock:
+                    missing = [] if self._finished else self.mailbox.missing(self._at, self._time_ns)
+                    moved, time_ns = self._moved, self._time_ns
+                    if self._watch is not None:
+                        self._watch.close()
+                if moved == last_moved and missing:
+                    on_wait(time_ns, [link.plan.source for link in missing])
+                last_moved = moved
+            self._wake.clear()
+
+    def _receive(self, payload: bytes) -> None:
+        """Takes a payload in Zenoh's thread, and moves the role as far as that lets it."""
+        with self._lock:
+            try:
+                self._deliver(payload)
+                if self._in_handler and self._advance():
+                    self._in_handler = False
+                    self._wake.set()
+            except BaseException as error:  # nobody above would learn of it
+                self._failure, self._in_handler = error, False
+                self._wake.set()
+
+    def _advance(self) -> bool:
+        """Runs stages until one misses something; returns True if it stopped for another reason."""
+        mailbox, stages, watch = self.mailbox, self._stages, self._watch
+        for _ in range(STRETCH):
+            if self._finished or self._failure is not None:
+                return True
+            number, stage = stages[self._at]
+            if self._time_ns % stage.period_ns == 0:
+                if mailbox.missing(number, self._time_ns):
+                    return False
+                if self._run_stage(number, stage, self._time_ns):
+                    self._wake.set()  # a batch is complete: the main thread sends it
+            self._moved += 1
+            self._at += 1
+            if self._at == len(stages):
+                self._at = 0
+                self._time_ns += self._tick_ns
+                self._finished = self._time_ns > self.plan.duration_ns
+                if self._finished and watch is not None:
+                    watch.close()
+            if watch is not None and len(watch.batches) >= MAX_BATCHES:
+                return True
+        return True
 
     def wall_clock(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
 
         Within a period, stages have deadlines in the order of their levels; the last ends with the period.
         """
+        assert self._inbox is not None
         levels = max(node.depth for node in self.plan.nodes) * 2 + 3
-        mailbox, inbox, counts = self.mailbox, self._inbox, self.counts
-        stages = list(enumerate(self.role.stages))
+        mailbox, counts, take = self.mailbox, self.counts, self._inbox.take
         for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
             _sleep_until(start_ns + time_ns)
-            for number, stage in stages:
+            for number, stage in self._stages:
                 if time_ns % stage.period_ns:
                     continue
-                deadline_ns = start_ns + time_ns + self._tick_ns * stage.level // levels
-                self._deliver(inbox.take(0))
-                while missing := mailbox.missing(number, time_ns):
+                deadline_ns = start_ns + time_ns + stage.period_ns * stage.level // levels
+                for payload in take(0):
+                    self._deliver(payload)
+                while mailbox.missing(number, time_ns):
                     left_ns = deadline_ns - time.monotonic_ns()
                     if left_ns <= 0:
                         counts.late += 1
                         break
-                    self._deliver(inbox.take(len(missing), left_ns * 1e-9))
+                    for payload in take(left_ns * 1e-9):
+                        self._deliver(payload)
                 counts.stages += 1
-                counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns if stage.level else 0)
+                if stage.level:
+                    counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns)
                 self._run_stage(number, stage, time_ns)
             self.flush()
-
-    def _run_stage(self, number: int, stage: Stage, time_ns: int) -> None:
-        for message in stage.run(time_ns, self.mailbox.take(number, time_ns)):
-            self._send(message)
-
-    def _send(self, message: Message) -> None:
-        payload = encode(message)
-        self.counts.messages += 1
-        self._publishers[message.channel].put(payload)
-        if self._watch is not None:
-            self._watch.add(payload)
-
-    def _deliver(self, payloads: list[bytes]) -> None:
-        for payload in payloads:
-            try:
-                message = decode(payload)
-            except WireError as error:
-                self.counts.refused[error.reason] = self.counts.refused.get(error.reason, 0) + 1
-                continue
-            self.mailbox.deliver(message)
 
     def flush(self) -> None:
         """Sends what is held back for those who watch."""
         if self._watch is not None:
-            self._watch.flush()
+            self._watch.close()
+            self._watch.send()
+
+    def _run_stage(self, number: int, stage: Stage, time_ns: int) -> bool:
+        """Runs a stage and puts what it returns; returns True if that completes a batch for the watchers."""
+        complete = False
+        for message in stage.run(time_ns, self.mailbox.take(number, time_ns)):
+            complete |= self._send(message)
+        return complete
+
+    def _send(self, message: Message) -> bool:
+        payload = encode(message)
+        self.counts.messages += 1
+        self._puts[message.channel](payload)
+        return self._watch is not None and self._watch.add(payload)
+
+    def _deliver(self, payload: bytes) -> None:
+        try:
+            message = decode(payload)
+        except WireError as error:
+            self.counts.refused[error.reason] = self.counts.refused.get(error.reason, 0) + 1
+            return
+        self.mailbox.deliver(message)
 
 
 def _sleep_until(instant_ns: int) -> None:

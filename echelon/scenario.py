@@ -1,29 +1,26 @@
 """The scenario: what a user writes, as pydantic models.  Every key is known, every value has a range and SI units.
 
 A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
-then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.load`; the plan that roles work with is
-made in `echelon.planning`.
+then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.load`; the plan that roles work with
+is made in `echelon.planning`.
 """
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Limit = Annotated[float, Field(gt=0)]
-Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Point = tuple[Finite, Finite]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
-Matrix = list[list[Finite]]
+from echelon.values import CouplingGain, Finite, Flag, Fraction, Gain, Limit, Name, NonNegative, Point, Positive
+from echelon.values import number_or_table as _number_or_table
+
 ChannelName = Literal["state", "group_state", "reference", "command", "*"]
+BLOCK_NAMES = ("intra", "inter", "centroid")
+"""Names of blocks and layers of blocks, which groups therefore cannot have."""
 
 
 class Table(BaseModel):
     """A TOML table: unknown keys are mistakes."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, str_strip_whitespace=False)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Periods(Table):
@@ -68,7 +65,7 @@ class Shape(Table):
     kind: Literal["triangle", "polygon", "line", "column", "wedge", "points", "vectors"]
     side: Positive | None = None
     spacing: Positive | None = None
-    angle: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    angle: Annotated[float, Field(strict=True, gt=0, lt=180)] = 90.0
     """Between the arms of a wedge [degrees]"""
     rotation: Finite = 0.0
     """Counter-clockwise [degrees]"""
@@ -107,6 +104,8 @@ class Group(Table):
             raise ValueError(f"{twice[0]!r} names a robot and a group")
         if "coordinator" in self.robots or "coordinator" in self.groups:
             raise ValueError("'coordinator' is the name of the root")
+        if taken := sorted(self.groups.keys() & set(BLOCK_NAMES)):
+            raise ValueError(f"a group cannot be called {taken[0]!r}: {', '.join(BLOCK_NAMES)} are names of blocks")
         if len(self.robots) + len(self.groups) > 1 and self.shape is None:
             raise ValueError("a group of several children needs a shape")
         return self
@@ -155,7 +154,7 @@ class Waypoints(Table):
         if len(self.times) != len(self.points):
             raise ValueError(f"{len(self.points)} points need as many times, not {len(self.times)}")
         if any(late <= early for early, late in zip(self.times, self.times[1:], strict=False)):
-            raise ValueError("times must ascend")
+            raise ValueError("times must ascend, and no two be equal")
         return self
 
 
@@ -167,8 +166,8 @@ class Gains(Table):
 
     block: str = "*"
     """Which blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
-    k1: Positive | Matrix = 1.0
-    k2: Positive | Matrix = 1.0
+    k1: Gain = 1.0
+    k2: Gain = 1.0
 
 
 class Coupling(Table):
@@ -177,7 +176,7 @@ class Coupling(Table):
     block: str = "*"
     onto: str = "*"
     """The block whose error rate acts on `block`"""
-    value: Finite | Matrix
+    value: CouplingGain
 
 
 class Law(Table):
@@ -185,20 +184,20 @@ class Law(Table):
 
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
-    epsilon: Annotated[list[Annotated[float, Field(gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
+    epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
     """ε1, ε2, …: each block's σ is a product of the first ones"""
     gains: list[Gains] = []
     """Later entries override earlier ones"""
     coupling: list[Coupling] = []
     """Later entries override earlier ones; none means no coupling"""
-    lead: Annotated[float, Field(ge=0, le=1)] = 0.0
+    lead: Fraction = 0.0
     """How far ahead the law looks, in periods: 0 is the paper's law as it stands, 0.5 makes up for the hold"""
 
 
 class Avoidance(Table):
     """Collision avoidance (theory.md section 4)."""
 
-    enabled: bool = False
+    enabled: Flag = False
     """False: robots do not avoid each other, but distances below `avoidance_radius` are still violations"""
     avoidance_radius: Positive = 0.25
     """r_a [m]"""
@@ -211,7 +210,7 @@ class Avoidance(Table):
     def _radii(self) -> "Avoidance":
         if self.sensing_radius <= self.avoidance_radius:
             raise ValueError(
-                f"sensing_radius {self.sensing_radius} must be larger than avoidance_radius {self.avoidance_radius}"
+                f"sensing_radius = {self.sensing_radius} must be larger than avoidance_radius = {self.avoidance_radius}"
             )
         return self
 
@@ -225,8 +224,13 @@ class Uniform(Table):
     @model_validator(mode="after")
     def _bounds(self) -> "Uniform":
         if self.max < self.min:
-            raise ValueError(f"max {self.max} must not be less than min {self.min}")
+            raise ValueError(f"max = {self.max} must be at least min = {self.min}")
         return self
+
+
+Delay = Annotated[
+    Annotated[NonNegative, Tag("a number")] | Annotated[Uniform, Tag("a table")], Discriminator(_number_or_table)
+]
 
 
 class LinkRule(Table):
@@ -236,7 +240,7 @@ class LinkRule(Table):
     source: str = "**"
     receiver: str = "**"
     channel: ChannelName = "*"
-    delay: NonNegative | Uniform = 0.0
+    delay: Delay = 0.0
     """[s]"""
     loss: Fraction = 0.0
     """Probability that a message is lost, independent of all others"""
@@ -247,10 +251,10 @@ class LinkRule(Table):
 class Can(Table):
     """The CAN bus."""
 
-    enabled: bool = True
+    enabled: Flag = True
     url: str = "auto"
     """`socketcan:vcan0`, `udp_multicast:…`, `virtual`; `auto` takes vcan0 where it is up, else udp_multicast"""
-    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    bitrate: Annotated[int, Field(strict=True, ge=10_000, le=1_000_000)] = 1_000_000
     """[bit/s], for the bus load"""
     torque_scale: Positive = 0.001
     """Newton metres per bit of the torque frame; ±32767 bits fit"""
@@ -260,7 +264,8 @@ class Record(Table):
     """The recording."""
 
     display_period: Positive = 0.02
-    """Between transforms, markers, odometry and joint states [s of run time]; states themselves are all recorded"""
+    """Between transforms, markers, odometry and joint states [s of run time], at least the period of accelerations;
+    states themselves are all recorded"""
 
 
 class Claim(Table):
@@ -269,7 +274,7 @@ class Claim(Table):
     block: str
     settled_by: Positive
     """[s]"""
-    band: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    band: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.05
     """Settled means: stays within this fraction of the block's largest error"""
 
 
@@ -280,7 +285,7 @@ class Scenario(Table):
     description: str = ""
     duration: Positive
     """[s of run time]"""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = 1
     periods: Periods = Periods()
     robot: RobotTable = RobotTable()
     """What all robots have in common"""

@@ -1,8 +1,8 @@
 """The wire: messages as bytes, and the keys they travel under.
 
 Header, little endian (32 bytes): schema version u16, channel u8, zero u8, source u32, sequence u64, time [ns] i64,
-number of values u32, zero u32; then that many float64.  The schema version stands here and in the presence tokens, never
-in a data key: a peer of another version is refused by name and not met with silence.
+number of values u32, zero u32; then that many float64.  The schema version stands here and in the presence tokens,
+never in a data key: a peer of another version is refused by name and not met with silence.
 """
 
 import struct
@@ -16,7 +16,13 @@ SCHEMA_VERSION: Final = 1
 HEADER: Final = struct.Struct("<HBBIQqII")
 _CHANNELS: Final = {int(channel): channel for channel in Channel}
 _LENGTH: Final = struct.Struct("<I")
+_VERSION: Final = struct.Struct("<H")
 _FLOAT64: Final = np.dtype("<f8")
+# Bound once, for one message is decoded for every message of every tick.
+_HEADER_SIZE: Final = HEADER.size
+_unpack: Final = HEADER.unpack_from
+_view: Final = np.frombuffer
+_channel_of: Final = _CHANNELS.get
 
 
 class WireError(ValueError):
@@ -40,17 +46,28 @@ def encode(message: Message) -> bytes:
 
 def decode(payload: bytes) -> Message:
     """Returns the message; its values are a view of `payload`.  Raises WireError on anything else."""
-    if len(payload) < HEADER.size:
-        raise WireError("too short")
-    version, channel, _, source, sequence, time_ns, count, _ = HEADER.unpack_from(payload)
-    if version != SCHEMA_VERSION:
-        raise WireError(f"schema version {version}, here {SCHEMA_VERSION}")
-    if channel not in _CHANNELS:
-        raise WireError(f"unknown channel {channel}")
-    if len(payload) != HEADER.size + 8 * count:
-        raise WireError("length does not match")
-    values = np.frombuffer(payload, _FLOAT64, count, HEADER.size)
-    return Message(_CHANNELS[channel], source, sequence, time_ns, values)
+    size = len(payload)
+    if size < _HEADER_SIZE:
+        raise _refusal(payload)
+    version, number, zero, source, sequence, time_ns, count, zeros = _unpack(payload)
+    channel = _channel_of(number)
+    if version != SCHEMA_VERSION or channel is None or zero or zeros or size != _HEADER_SIZE + 8 * count:
+        raise _refusal(payload)
+    return Message(channel, source, sequence, time_ns, _view(payload, _FLOAT64, count, _HEADER_SIZE))
+
+
+def _refusal(payload: bytes) -> WireError:
+    """Returns what is wrong with bytes that are no message; the version first, for it says what the rest may mean."""
+    if len(payload) >= _VERSION.size:
+        (version,) = _VERSION.unpack_from(payload)
+        if version != SCHEMA_VERSION:
+            return WireError(f"schema version {version}, here {SCHEMA_VERSION}")
+    if len(payload) < _HEADER_SIZE:
+        return WireError("too short")
+    _, number, zero, _, _, _, _, zeros = _unpack(payload)
+    if number not in _CHANNELS:
+        return WireError(f"unknown channel {number}")
+    return WireError("reserved bytes are not zero" if zero or zeros else "length does not match")
 
 
 def join(payloads: list[bytes]) -> bytes:
@@ -77,9 +94,10 @@ def data_key(run: str, path: str, channel: Channel) -> str:
     return "/".join(chunk for chunk in ("echelon", run, path, channel.name.lower()) if chunk)
 
 
-def watch_key(run: str, name: str) -> str:
-    """Returns the key under which a member's messages go to those who watch a run, in batches (`join`)."""
-    return f"echelon/{run}/@watch/{name}"
+def watch_key(run: str, role: str, name: str) -> str:
+    """Returns the key under which a member's messages go to those who watch a run, in batches (`join`); `role` and
+    `name` may be wildcards."""
+    return f"echelon/{run}/@watch/{role}/{name}"
 
 
 def token_key(run: str, role: str, name: str, boot_id: str) -> str:

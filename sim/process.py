@@ -5,6 +5,7 @@ when it is told to, and says `done` with what it counted.  Its words on standard
 """
 
 import ctypes
+import gc
 import os
 import resource
 import signal
@@ -132,6 +133,8 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
         virtual=spec.virtual,
     )
     start_ns = meet(spec, session, control)
+    gc.collect()
+    gc.disable()  # nothing in the loop makes cycles, and a pause of one role is a pause of all
     try:
         if spec.virtual:
             runner.lockstep(lambda time_ns, sources: control.send(("waiting", time_ns, sources)))

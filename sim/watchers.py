@@ -41,7 +41,7 @@ class Reception:
     def take(self, timeout_s: float) -> list[Message]:
         """Waits for a batch; returns the messages that can go now."""
         messages: list[Message] = []
-        for batch in self._inbox.take(1, timeout_s):
+        for batch in self._inbox.take(timeout_s):
             messages.extend(self._unpack(batch))
         if not messages:
             return []
@@ -91,7 +91,7 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     sources = ends(plan)
     if spec.can_url:
         sources[len(plan.members)] = plan.duration_ns - plan.duration_ns % plan.robots[0].period_ns
-    reception = Reception(session.subscribe(watch_key(spec.run, "*", "**"), backpressure=True, high_water=HIGH_WATER), sources)
+    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources)
     recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
     meet(spec, session, control)
     said_s = time.monotonic()
@@ -165,7 +165,7 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
     plan = spec.plan
     all_ends = ends(plan)
     reception = Reception(
-        session.subscribe(watch_key(spec.run, "robot", "**"), backpressure=True, high_water=HIGH_WATER),
+        session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER),
         {robot.index: all_ends[robot.index] for robot in plan.robots},
     )
     publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))

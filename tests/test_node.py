@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trees import PAPER_TREE, Tree, plan_of, random_epsilon, scenario, trees, with_random_gains
 
-from agents.plant import RobotState
+from agents.plant import state_at
 from agents.robot import Robot
 from controller.law import BlockGains, CentralLaw
 from echelon.messages import NULL, STATE_FIELDS, Channel, Message
@@ -39,7 +39,7 @@ class Watched:
         for role in self.engine.roles:
             if isinstance(role, Robot):
                 x, y = plan.robots[role.index].start
-                role.state = RobotState(x, y, *random.normal(size=3, scale=(2, 3, 2)).tolist())
+                role.state = state_at(x, y, *random.normal(size=3, scale=(2, 3, 2)).tolist())
         self.instants = list(self.engine.instants())
 
     def _note(self, message: Message) -> None:

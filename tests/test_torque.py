@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from synthetic import PAPER
 from trees import plan_of, scenario
 
-from agents.plant import RobotState, make_step
+from agents.plant import RobotState, make_step, state_at
 from agents.robot import Robot
 from agents.torque import TorqueLimits, make_inverse
 from echelon.load import load
@@ -28,7 +28,7 @@ def lab() -> RobotPlan:
 
 
 def velocity(robot: RobotPlan, state: RobotState) -> Array:
-    _, _, theta, v, omega = state
+    theta, v, omega = state[2:5]
     d = robot.offset
     return np.array([v * cos(theta) - d * omega * sin(theta), v * sin(theta) + d * omega * cos(theta)])
 
@@ -36,7 +36,7 @@ def velocity(robot: RobotPlan, state: RobotState) -> Array:
 def test_wanted_acceleration_is_what_the_plant_does(lab):
     inverse, step, h = make_inverse(lab), make_step(lab), 1e-5
     for (theta, v, omega), wanted in product(STATES, WANTED):
-        state = RobotState(1.0, 2.0, theta, v, omega)
+        state = state_at(1.0, 2.0, theta, v, omega)
         torques = inverse(state, *wanted, 0.0)
         after, before = step(state, *torques, h), step(state, *torques, -h)
         found = (velocity(lab, after) - velocity(lab, before)) / (2 * h)
@@ -46,7 +46,7 @@ def test_wanted_acceleration_is_what_the_plant_does(lab):
 def test_robot_with_its_point_behind_the_axle_does_it_too(lab):
     behind = replace(lab, offset=-lab.offset)
     inverse, step, h = make_inverse(behind), make_step(behind), 1e-5
-    state = RobotState(0.0, 0.0, 0.4, 0.5, -1.0)
+    state = state_at(0.0, 0.0, 0.4, 0.5, -1.0)
     torques = inverse(state, 1.0, -2.0, 0.0)
     found = (velocity(behind, step(state, *torques, h)) - velocity(behind, step(state, *torques, -h))) / (2 * h)
     np.testing.assert_allclose(found, (1.0, -2.0), atol=1e-6)
@@ -55,7 +55,7 @@ def test_robot_with_its_point_behind_the_axle_does_it_too(lab):
 def drift(robot: RobotPlan, h: float, lead: float) -> float:
     """Returns how far ṗ is, after 0.2 s of one acceleration, from what it would be under ideal torque [m/s]."""
     inverse, step, wanted = make_inverse(robot), make_step(robot), np.array([1.5, -2.0])
-    state = RobotState(0.0, 0.0, 1.2, 0.6, 2.0)
+    state = state_at(0.0, 0.0, 1.2, 0.6, 2.0)
     start = velocity(robot, state)
     for _ in range(round(0.2 / h)):
         state = step(state, *inverse(state, *wanted, lead * h), h)
@@ -84,11 +84,11 @@ def test_lead_looks_at_the_robot_as_it_will_be(lab):
             c * 2.0 + sn * -1.0 + d * omega**2, (c * -1.0 - sn * 2.0 - v * omega) / d,
         ]  # fmt: skip
 
-    state, inverse = RobotState(0.0, 0.0, 0.7, 0.9, -2.0), make_inverse(lab)
+    state, inverse = state_at(0.0, 0.0, 0.7, 0.9, -2.0), make_inverse(lab)
     errors = []
     for lead in (4e-3, 2e-3, 1e-3):
-        later = solve_ivp(ideal, (0, lead), state, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-        then = inverse(RobotState(*later.tolist()), 2.0, -1.0, 0.0)
+        later = solve_ivp(ideal, (0, lead), state[:5], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        then = inverse(state_at(*later.tolist()), 2.0, -1.0, 0.0)
         errors.append(np.abs(np.subtract(inverse(state, 2.0, -1.0, lead), then)).max())
     assert [errors[0] / errors[1], errors[1] / errors[2]] == pytest.approx([4, 4], rel=0.2)
 
@@ -162,7 +162,7 @@ def counted(inner_period: float, commands: list[tuple[float, float]], **limits: 
                  periods={"acceleration": 0.01, "torque": inner_period})
     )  # fmt: skip
     robot = Robot(plan, 0)
-    robot.state = RobotState(0.0, 0.0, 0.0, 0.0, 0.0)
+    robot.state = state_at(0.0, 0.0, 0.0, 0.0, 0.0)
     said = []
     for number, command in enumerate(commands):
         now = number * 10_000_000

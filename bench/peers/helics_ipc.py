@@ -10,14 +10,14 @@ try:
 except ImportError:  # reported by the caller
     pass
 
-from bench.tree import COORDINATOR, LEADERS, ROBOTS, ROLES, Meter, Role, die_with_parent, play, run_processes
+from bench.tree import BlockingPorts, COORDINATOR, LEADERS, ROBOTS, ROLES, Meter, Role, die_with_parent, play, run_processes
 
 REQUIRES = ("helics",)
 _STEPS = 4  # of HELICS time in a tick: state, group state, reference, command
 _OFFSET = {"state": 1, "group": 2, "reference": 3, "command": 4}
 
 
-class _Federate:
+class _Federate(BlockingPorts):
     def __init__(self, federate: Any, publications: dict[str, Any], inputs: dict[str, list[Any]]) -> None:
         self._federate, self._publications, self._inputs = federate, publications, inputs
         self._request, self._publish = helics.helicsFederateRequestTime, helics.helicsPublicationPublishBytes

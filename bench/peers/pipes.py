@@ -6,12 +6,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from bench.tree import COORDINATOR, FIELDS, HEADER, LEADERS, ROLES, Ports, Role, run_roles
+from bench.tree import BlockingPorts, COORDINATOR, FIELDS, HEADER, LEADERS, ROLES, Ports, Role, run_roles
 
 REQUIRES = ()
 
 
-class _Pipes:
+class _Pipes(BlockingPorts):
     def __init__(self, senders: dict[str, list[int]], receivers: dict[str, list[int]]) -> None:
         self._senders, self._receivers = senders, receivers
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.tree import GROUPS, ROBOTS, Ports, Role, run_roles
+from bench.tree import BlockingPorts, GROUPS, ROBOTS, Ports, Role, run_roles
 
 if TYPE_CHECKING:
     import zmq
@@ -58,7 +58,7 @@ def connect(role: Role, folder: Path) -> Iterator[Ports]:
     context.destroy()
 
 
-class _Sockets:
+class _Sockets(BlockingPorts):
     def __init__(self, sockets: dict[str, zmq.Socket[bytes]]) -> None:
         self._sockets = sockets
 

@@ -1,17 +1,57 @@
-"""Zenoh, through the session all roles of this project use: a tree of links over TCP on the loopback."""
+"""Zenoh, through the session all roles of this project use: a tree of links, each role at work where messages arrive."""
 
 from __future__ import annotations
 
+import threading
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from bench.tree import COORDINATOR, LEADERS, ROBOTS, Ports, Role, run_roles
-
-if TYPE_CHECKING:
-    from echelon.session import Inbox, Publisher
+from bench.tree import COORDINATOR, LEADERS, ROBOTS, ROLES, Play, Ports, Role, run_roles
 
 REQUIRES = ("zenoh",)
+TIMEOUT_S = 30.0
+
+
+class _Handler:
+    """Runs a role in the handler of the messages it waits for, as `echelon.runner` does."""
+
+    def __init__(self, senders: dict[str, int]) -> None:
+        self._waiting: dict[str, deque[bytes]] = {channel: deque() for channel in senders}
+        self._senders = senders
+        self._lock = threading.Lock()
+        self._play: Play | None = None
+        self._channel = ""
+        self._value = 0.0
+        self._done = threading.Event()
+        self.puts: dict[str, object] = {}
+
+    def send(self, channel: str, payload: bytes) -> None:
+        self.puts[channel](payload)  # type: ignore[operator]
+
+    def receive(self, channel: str, payload: bytes) -> None:
+        with self._lock:
+            self._waiting[channel].append(payload)
+            if self._play is not None:
+                self._advance(self._play)
+
+    def drive(self, play: Play) -> float:
+        with self._lock:
+            self._channel = next(play)
+            self._play = play
+            self._advance(play)
+        if not self._done.wait(TIMEOUT_S * 10):
+            raise TimeoutError("a message is missing")
+        return self._value
+
+    def _advance(self, play: Play) -> None:
+        while not self._done.is_set() and len(self._waiting[self._channel]) >= self._senders[self._channel]:
+            waiting = self._waiting[self._channel]
+            try:
+                self._channel = play.send([waiting.popleft() for _ in range(self._senders[self._channel])])
+            except StopIteration as end:
+                self._value = end.value
+                self._done.set()
 
 
 def run(ticks: int, folder: Path) -> None:
@@ -26,36 +66,27 @@ def run(ticks: int, folder: Path) -> None:
         below: list[Role] = []
         if role.number is not None:
             above = [Role(role.group)]
-            sends, receives = {"state": role}, {"command": above}
+            sends, receives = ["state"], {"command": above}
         elif role.group is not None:
             above, below = [COORDINATOR], [Role(role.group, number) for number in range(ROBOTS)]
-            sends, receives = {"group": role, "command": role}, {"state": below, "reference": above}
+            sends, receives = ["group", "command"], {"state": below, "reference": above}
         else:
             below = list(LEADERS)
-            sends, receives = {"reference": role}, {"group": below}
+            sends, receives = ["reference"], {"group": below}
+        ports = _Handler({channel: len(sources) for channel, sources in receives.items()})
         with Session(
             listen=[endpoints[role]] if below else [], connect=[endpoints[one] for one in above], lockstep=True
         ) as session:
-            keys = {
-                channel: [f"{run}/{one.name}/{channel}" for one in sources] for channel, sources in receives.items()
-            }
-            inbox = session.subscribe([key for group in keys.values() for key in group])
-            publishers = {channel: session.publisher(f"{run}/{role.name}/{channel}") for channel in sends}
+            for channel, sources in receives.items():
+                keys = [f"{run}/{one.name}/{channel}" for one in sources]
+                session.subscribe(keys, lambda payload, channel=channel: ports.receive(channel, payload))  # type: ignore[misc]
+            ports.puts = {channel: session.publisher(f"{run}/{role.name}/{channel}").put for channel in sends}
             session.declare_token(f"{run}/@alive/{role.name}")
-            missing = session.await_tokens([f"{run}/@alive/{one.name}" for one in above + below], 30.0)
+            tokens = session.watch_tokens(f"{run}/@alive/*")
+            missing = tokens.wait([f"{run}/@alive/{one.name}" for one in above + below], TIMEOUT_S)
             if missing:
                 raise TimeoutError(f"{role.name} misses {sorted(missing)}")
-            yield _Keys(inbox, keys, publishers)
+            yield ports
 
+    assert set(endpoints) < set(ROLES)
     run_roles(connect, ticks, folder)
-
-
-class _Keys:
-    def __init__(self, inbox: Inbox, keys: dict[str, list[str]], publishers: dict[str, Publisher]) -> None:
-        self._inbox, self._keys, self._publishers = inbox, keys, publishers
-
-    def send(self, channel: str, payload: bytes) -> None:
-        self._publishers[channel].put(payload)
-
-    def receive(self, channel: str) -> list[bytes]:
-        return self._inbox.take(keys=self._keys[channel], timeout_s=10.0)

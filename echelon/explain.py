@@ -1,0 +1,195 @@
+"""Explains what pydantic found wrong with a scenario, in the words of the file: its key, its value, what is allowed."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from types import UnionType
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, Tag
+from pydantic_core import ErrorDetails
+
+from echelon.scenario import Scenario
+
+TEXTS: Final = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "finite_number": "must be a finite number",
+    "greater_than": "must be greater than {gt}",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than": "must be less than {lt}",
+    "less_than_equal": "must be at most {le}",
+    "bool_type": "must be true or false",
+    "string_type": "must be a string",
+    "string_unicode": "must be a string of Unicode characters",
+    "list_type": "must be an array",
+    "too_short": "must have {min_length} or more entries, not {actual_length}",
+    "too_long": "must have {max_length} or fewer entries, not {actual_length}",
+    "dict_type": "must be a table",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+    "missing": "missing",
+}
+"""What is said of pydantic's types of errors; those that need more than their context are in `_text`."""
+
+NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits or underscores"
+PAIR_RULE: Final = "must be two numbers, [x, y]"
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """What is wrong: the keys that lead to the place, and the line that says so."""
+
+    keys: tuple[str | int, ...]
+    text: str
+
+
+def explain(errors: Sequence[ErrorDetails]) -> Mistake:
+    """Returns the mistake to show first: an unknown key before the missing one that it may be meant to be."""
+    first = errors[0]
+    if first["type"] == "missing":
+        same_table = [e for e in errors if e["type"] == "extra_forbidden" and e["loc"][:-1] == first["loc"][:-1]]
+        first = same_table[0] if same_table else first
+    kind, value, location = first["type"], first["input"], first["loc"]
+    if kind.startswith("recursion"):
+        return Mistake(("formation",), "formation: groups are nested too deep")
+    if kind.startswith("string") and location[-1] == "[key]":  # not a value is wrong, but the key before it
+        keys, _ = _walk(location[:-1])
+        return Mistake(keys, f"{key_text(keys)}: {NAME_RULE}")
+    keys, annotation = _walk(location)
+    if kind == "extra_forbidden":
+        return Mistake(keys, f"{key_text(keys)}: {_unknown(str(keys[-1]), annotation)}")
+    if kind in ("union_tag_invalid", "union_tag_not_found"):  # of a table that says its `kind`
+        keys, kinds = (*keys, "kind"), list(_members(annotation))
+        if kind == "union_tag_not_found":
+            return Mistake(keys, f"{key_text(keys)}: missing; {_one_of(kinds)}")
+        return Mistake(keys, f"{key_text(keys)} = {value_text(value['kind'])}: {_one_of(kinds, value['kind'])}")
+    if kind == "missing" and isinstance(keys[-1], int):  # half of a pair: the pair is what is wrong
+        keys, kind = keys[:-1], "tuple_type"
+    text = PAIR_RULE if kind == "tuple_type" else _text(first, annotation)
+    shown = "" if kind in ("missing", "value_error") else f" = {value_text(value)}"
+    return Mistake(keys, f"{key_text(keys)}{shown}: {text}")
+
+
+def _text(error: ErrorDetails, annotation: Any) -> str:
+    """Returns what is allowed where an error is."""
+    kind, value = error["type"], error["input"]
+    if kind == "value_error":
+        return str(error["ctx"]["error"])
+    if kind == "literal_error":
+        return _one_of(get_args(_bare(annotation)), value)
+    if kind == "string_pattern_mismatch":
+        return NAME_RULE
+    if get_origin(_bare(annotation)) is tuple:
+        return PAIR_RULE
+    if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
+        return "is too large for a number"
+    if kind == "float_type" and _members(annotation):
+        return f"must be {' or '.join(_members(annotation))}"
+    if kind in TEXTS:
+        return TEXTS[kind].format_map({key: _limit(limit) for key, limit in error.get("ctx", {}).items()})
+    return error["msg"].replace("Input should", "must")
+
+
+def _limit(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _one_of(allowed: Sequence[str], value: Any = None) -> str:
+    names = ", ".join(repr(name) for name in allowed)
+    text = f"must be one of {names}" if len(allowed) > 1 else f"must be {names}"
+    close = get_close_matches(value, allowed, n=1) if isinstance(value, str) else []
+    return f"{text}; did you mean {close[0]!r}?" if close else text
+
+
+def _unknown(key: str, model: Any) -> str:
+    known = sorted(_bare(model).model_fields)
+    close = get_close_matches(key, known, n=1, cutoff=0.5)
+    return f"unknown key; did you mean {close[0]!r}?" if close else f"unknown key; known here: {', '.join(known)}"
+
+
+def _walk(location: Sequence[str | int]) -> tuple[tuple[str | int, ...], Any]:
+    """Follows a location of pydantic's through the scenario's types.
+
+    Returns the parts of it that are keys of the file, for some only name the member of a union; and the type it leads
+    to.  A location that ends with an unknown key leads to the type of its table.
+    """
+    keys: list[str | int] = []
+    annotation: Any = Scenario
+    for at, part in enumerate(location, start=1):
+        if members := _members(annotation):
+            member = members[str(part)]
+            if at < len(location) or _is_model(member):
+                annotation = member
+            continue  # a plain value that is no member of the union is explained as such
+        keys.append(part)
+        bare = _bare(annotation)
+        if _is_model(bare):
+            if str(part) in bare.model_fields:
+                annotation = bare.model_fields[str(part)].annotation
+        else:  # a list, a pair, or a table of tables: what it holds comes last
+            annotation = get_args(bare)[-1]
+    return tuple(keys), annotation
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(_bare(annotation), type) and issubclass(_bare(annotation), BaseModel)
+
+
+def _bare(annotation: Any) -> Any:
+    """Returns a type without its metadata, and without None."""
+    while get_origin(annotation) is Annotated or (_is_union(annotation) and len(_choices(annotation)) == 1):
+        annotation = get_args(annotation)[0] if get_origin(annotation) is Annotated else _choices(annotation)[0]
+    return annotation
+
+
+def _is_union(annotation: Any) -> bool:
+    return get_origin(annotation) in (Union, UnionType)
+
+
+def _choices(annotation: Any) -> list[Any]:
+    return [choice for choice in get_args(annotation) if choice is not type(None)]
+
+
+def _members(annotation: Any) -> dict[str, Any]:
+    """Returns the members of a union by the tags that name them in pydantic's locations; empty if it is none."""
+    bare = _bare(annotation)
+    return {_tag(member): member for member in _choices(bare)} if _is_union(bare) else {}
+
+
+def _tag(member: Any) -> str:
+    if get_origin(member) is Annotated:
+        return next(data.tag for data in get_args(member) if isinstance(data, Tag))
+    literal = member.model_fields["kind"].annotation
+    assert get_origin(literal) is Literal
+    return str(get_args(literal)[0])
+
+
+def key_text(keys: Sequence[str | int]) -> str:
+    """Returns a path of keys as `--set` takes it: `links.0.delay`; what TOML would quote is quoted."""
+    return ".".join(str(key) if re.fullmatch(r"[A-Za-z0-9_-]+", str(key)) else short(json.dumps(key)) for key in keys)
+
+
+def value_text(value: Any) -> str:
+    """Returns a value as TOML writes it, or nearly, on at most 60 characters."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return short(f"[{', '.join(value_text(item) for item in value[:30])}]")
+    if isinstance(value, int) and value.bit_length() > 1000:  # Python refuses to write such a number out
+        return f"an integer of {value.bit_length()} bits"
+    if isinstance(value, (str, int, float)):
+        return short(repr(value))
+    return "{...}" if isinstance(value, dict) else short(str(value))
+
+
+def short(text: str) -> str:
+    """Returns a text on at most 60 characters."""
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def one_line(text: str) -> str:
+    """Returns a text with everything that is not printable escaped: one line, whatever was in the file."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -1,0 +1,184 @@
+"""The members of a plan: walks the scenario's tree, hands down what robots inherit, and numbers robots and nodes."""
+
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from math import isfinite, radians
+from typing import Any, Final
+
+from echelon import shapes
+from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
+from echelon.scenario import Group, RobotTable, Scenario, Shape
+
+ROBOT_DEFAULTS: Final[dict[str, Any]] = {
+    "model": "paper",
+    "heading": 0.0,
+    "torque_limit": float("inf"),
+    "torque_rate_limit": float("inf"),
+    "wheel_speed_limit": float("inf"),
+}
+NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
+"""What must be said of every robot, on some level."""
+MAX_ROBOTS: Final = 127
+"""As many as the native torque frame has identifiers for."""
+MAX_NS: Final = 2**62
+"""146 years: sums of two instants still fit the message header."""
+
+
+def nanoseconds(seconds: float, key: str) -> int:
+    """Returns a duration in nanoseconds.  Raises PlanError unless that is a whole number, rounding of sums aside."""
+    exact = Decimal(repr(seconds)) * 10**9  # of the digits as written: a float of many seconds lacks some
+    if not 1 <= exact < MAX_NS or abs(exact - round(exact)) > Decimal("1e-3"):
+        raise PlanError(f"{key} = {seconds}: must be a whole number of nanoseconds, at least 1 and less than {MAX_NS}")
+    return round(exact)
+
+
+def make_members(scenario: Scenario) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...]]:
+    """Returns robots and nodes by their numbers.  Raises PlanError."""
+    count = _count_robots(scenario.formation)
+    if count > MAX_ROBOTS:
+        raise PlanError(f"formation: {count} robots, but a bus has identifiers for {MAX_ROBOTS}")
+    walk = _Walk(
+        acceleration_ns=nanoseconds(scenario.periods.acceleration, "periods.acceleration"),
+        torque_ns=nanoseconds(scenario.periods.torque, "periods.torque"),
+        first_node=count,
+    )
+    walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
+    return tuple(walk.robots), tuple(walk.nodes)
+
+
+def robot_key(path: str) -> str:
+    """Returns the key of a robot in the scenario: `formation.groups.g1.robots.r2` of `g1/r2`."""
+    *groups, robot = path.split("/")
+    return ".".join(["formation", *(f"groups.{group}" for group in groups), "robots", robot])
+
+
+def _count_robots(group: Group) -> int:
+    return len(group.robots) + sum(_count_robots(sub) for sub in group.groups.values())
+
+
+def _count_nodes(group: Group) -> int:
+    return 1 + sum(_count_nodes(sub) for sub in group.groups.values())
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a member stands: its key in the scenario, its path in the tree, its parent, which child of it, how deep."""
+
+    key: str
+    path: str
+    parent: int | None
+    child_number: int
+    depth: int
+
+
+class _Walk:
+    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them."""
+
+    def __init__(self, acceleration_ns: int, torque_ns: int, first_node: int) -> None:
+        self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
+        self.robots: list[RobotPlan] = []
+        self.nodes: list[NodePlan] = []
+
+    def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
+        """Adds a group and all below it; returns its node."""
+        index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
+        first_robot = len(self.robots)
+        inherited = _overlaid(inherited, group.robot)
+        period_ns, period_key = self._acceleration_ns, "periods.acceleration"
+        if group.period is not None:
+            period_key = f"{place.key}.period"
+            period_ns = nanoseconds(group.period, period_key)
+        if period_ns % self._torque_ns:
+            raise PlanError(f"periods.torque = {self._torque_ns / 1e9}: must divide {period_key} = {period_ns / 1e9}")
+        below = _Place(place.key, f"{place.path}/" if place.path else "", index, 0, place.depth + 1)
+        children: list[RobotPlan | NodePlan] = []
+        for name, table in group.robots.items():
+            at = replace(below, key=f"{place.key}.robots.{name}", path=below.path + name, child_number=len(children))
+            self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
+            children.append(self.robots[-1])
+        for name, sub in group.groups.items():
+            at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
+            child = self.add_group(sub, at, inherited)
+            if period_ns % child.period_ns:
+                raise PlanError(
+                    f"{period_key} = {period_ns / 1e9}: must be a multiple of {child.period_ns / 1e9}, "
+                    f"the period of {child.name}"
+                )
+            children.append(child)
+        node = NodePlan(
+            index=index,
+            path=place.path,
+            parent=place.parent,
+            child_number=place.child_number,
+            children=tuple(child.index for child in children),
+            weights=tuple(child.robots if isinstance(child, NodePlan) else 1 for child in children),
+            first_robot=first_robot,
+            depth=place.depth,
+            period_ns=period_ns,
+            shape=_shape(group.shape, len(children), f"{place.key}.shape"),
+        )
+        self.nodes.append(node)
+        return node
+
+    def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True)
+        for needed in NEEDED:
+            if needed not in values:
+                raise PlanError(f"{place.key}.{needed}: missing (neither here, nor in its group, nor in [robot])")
+        if values["offset"] == 0:
+            raise PlanError(f"{place.key}.offset = 0: must not be zero, or the wheels cannot steer the reference point")
+        least = values["mass"] * values["offset"] * values["offset"]
+        if values["inertia"] <= least:
+            raise PlanError(
+                f"{place.key}.inertia = {values['inertia']}: must be larger than mass·offset² = {least:.6g}"
+            )
+        assert place.parent is not None
+        return RobotPlan(
+            index=len(self.robots),
+            path=place.path,
+            parent=place.parent,
+            child_number=place.child_number,
+            period_ns=period_ns,
+            torque_period_ns=self._torque_ns,
+            **values,
+        )
+
+
+def _overlaid(table: RobotTable, over: RobotTable) -> RobotTable:
+    """Returns a table with what another says in its place."""
+    return table.model_copy(update=over.model_dump(exclude_none=True))
+
+
+def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:
+    """Returns the desired shape of a node with `count` children."""
+    if shape is None:
+        return ShapePlan("points", ((0.0, 0.0),))
+    points, kind, needed = _points(shape, count), "points", count
+    if shape.kind == "vectors":
+        kind, needed = "vectors", count - 1
+    if len(points) != needed:
+        what = f"{shape.kind}: " if shape.kind in ("points", "vectors") else f"kind = {shape.kind!r}: "
+        raise PlanError(f"{key}.{what}{len(points)} of them do not fit a group of {count}, which takes {needed}")
+    turned = tuple(shapes.rotated(points, shape.rotation))
+    if not all(isfinite(number) for point in turned for number in point):
+        raise PlanError(f"{key}: too large to be computed with")
+    return ShapePlan(kind, turned)
+
+
+def _points(shape: Shape, count: int) -> list[shapes.Point]:
+    side, spacing = shape.side or 0.0, shape.spacing or 0.0
+    match shape.kind:
+        case "triangle":
+            return shapes.triangle(side)
+        case "polygon":
+            return shapes.polygon(count, side)
+        case "line":
+            return shapes.line(count, spacing)
+        case "column":
+            return shapes.column(count, spacing)
+        case "wedge":
+            return shapes.wedge(count, spacing, radians(shape.angle))
+        case "vectors":
+            return shape.vectors or []
+        case "points":
+            return shape.points or []

@@ -1,0 +1,33 @@
+"""Kinds of values in a scenario, as pydantic checks them."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Discriminator, Field, Tag
+
+# Numbers are strict: neither true nor "1.5" is one.
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+Limit = Annotated[float, Field(strict=True, gt=0)]
+Fraction = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
+Flag = Annotated[bool, Field(strict=True)]
+Point = tuple[Finite, Finite]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+Matrix = list[list[Finite]]
+
+
+def number_or_table(value: Any) -> str:
+    """Tells which member of a union a value is meant to be, so that a mistake in it is explained as that member's."""
+    return "a table" if isinstance(value, (dict, BaseModel)) else "a number"
+
+
+def number_or_array(value: Any) -> str:
+    return "an array" if isinstance(value, (list, tuple)) else "a number"
+
+
+Gain = Annotated[
+    Annotated[Positive, Tag("a number")] | Annotated[Matrix, Tag("an array")], Discriminator(number_or_array)
+]
+CouplingGain = Annotated[
+    Annotated[Finite, Tag("a number")] | Annotated[Matrix, Tag("an array")], Discriminator(number_or_array)
+]

@@ -8,8 +8,10 @@ import ctypes
 import gc
 import os
 import resource
+import select
 import signal
 import sys
+import threading
 import time
 import traceback
 from dataclasses import dataclass, field
@@ -73,7 +75,7 @@ def make_role(plan: Plan, index: int) -> Role:
 
 def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     """Entry point of every process of a run."""
-    _die_with_parent()
+    _die_with(control)
     _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # what ps, top and pgrep call it (15 characters)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal; the supervisor decides
     signal.signal(signal.SIGTERM, _leave)
@@ -152,8 +154,16 @@ def _leave(number: int, frame: object) -> None:
     raise SystemExit(0)
 
 
-def _die_with_parent() -> None:
-    """Ends this process with the one that made it, whatever becomes of the supervisor."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def _die_with(supervisor: Connection) -> None:
+    """Ends this process when the supervisor ends, however that ends, and whatever this process is doing then."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # the fork server is the parent; it may outlive the supervisor
     if os.getppid() == 1:
         os._exit(1)
+    poller = select.poll()
+    poller.register(supervisor.fileno(), 0)  # no events but the hang-up
+
+    def wait() -> None:
+        poller.poll()
+        os._exit(1)
+
+    threading.Thread(target=wait, name="supervisor-watch", daemon=True).start()

@@ -1,7 +1,7 @@
 """Brings the processes of a run up, watches over them, and takes them down again.
 
 All processes come from one fork server that has imported what they need, so fifteen start in the time of one.  Nothing
-outlives the supervisor: processes die with the fork server, and that ends when the supervisor does, even by kill -9.
+outlives the supervisor: every process sees its pipe to it hang up, and ends, even when the supervisor was killed.
 They talk over the loopback, at an address and ports of this run's own.
 """
 

@@ -52,7 +52,8 @@ def test_effective_scenario_runs_again_to_the_same_trace(folder: Path, tmp_path:
 
 def test_can_log_decodes_to_the_torques_of_the_trace(folder: Path) -> None:
     database = cantools.database.load_file(folder / "torque.dbc")
-    trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=0.2"))
+    plan = plan_of("paper", "duration=0.2")
+    trace, half_a_bit = read_trace(folder / "run.mcap", plan), plan.can.torque_scale / 2
     lines = (folder / "can.log").read_text().splitlines()
     assert len(lines) == 9 * 200
     for number, line in enumerate(lines):
@@ -62,8 +63,8 @@ def test_can_log_decodes_to_the_torques_of_the_trace(folder: Path) -> None:
         assert float(stamp.strip("()")) == pytest.approx((tick + 1) / 1000)
         signals = database.decode_message(int(identifier, 16), bytes.fromhex(data))
         wanted = trace.states[robot][tick + 1]
-        assert signals["tau_right"] == pytest.approx(wanted[9], abs=2.5 + 1e-9)
-        assert signals["tau_left"] == pytest.approx(wanted[10], abs=2.5 + 1e-9)
+        assert signals["tau_right"] == pytest.approx(wanted[9], abs=half_a_bit + 1e-9)
+        assert signals["tau_left"] == pytest.approx(wanted[10], abs=half_a_bit + 1e-9)
 
 
 def test_a_failed_claim_is_exit_code_1(tmp_path: Path) -> None:

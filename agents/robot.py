@@ -28,7 +28,9 @@ class Robot:
         self._limits = TorqueLimits(
             robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit, robot.wheel_radius, robot.arm
         )
-        self._limited = any(limit != float("inf") for limit in (robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit))
+        self._limited = any(
+            limit != float("inf") for limit in (robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit)
+        )
         self._inner = robot.period_ns // robot.torque_period_ns
         self._h = robot.torque_period_ns * 1e-9
         self._at = 2 * robot.child_number

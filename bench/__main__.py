@@ -11,7 +11,9 @@ from bench import lockstep, product
 def main() -> int:
     """Measures and prints everything; the exit code is 1 if a peer failed."""
     parser = argparse.ArgumentParser(prog="python -m bench", description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--ticks", type=int, default=2000, help="ticks of a lockstep; slow peers run a fifth (default 2000)")
+    parser.add_argument(
+        "--ticks", type=int, default=2000, help="ticks of a lockstep; slow peers run a fifth (default 2000)"
+    )
     parser.add_argument("--repeat", type=int, default=5, help="runs of each kind (default 5)")
     parser.add_argument("--seconds", type=float, default=3.0, help="run time of paper.toml (default 3)")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")

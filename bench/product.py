@@ -93,6 +93,7 @@ def table(rows: list[Row]) -> str:
     """Lays out medians, smallest and largest."""
     lines = [f"{'':52} {'median':>9} {'min':>9} {'max':>9}"]
     lines += [
-        f"{f'{row.what} [{row.unit}]':52.64} {row.median:9.4g} {min(row.values):9.4g} {max(row.values):9.4g}" for row in rows
+        f"{f'{row.what} [{row.unit}]':52.64} {row.median:9.4g} {min(row.values):9.4g} {max(row.values):9.4g}"
+        for row in rows
     ]
     return "\n".join(lines)

@@ -51,7 +51,7 @@ class Bridge:
     acceleration period [ns]. Raises ValueError for more robots than identifiers, or a scale or period that is not
     positive."""
 
-    __slots__ = ("_codec", "_counters", "_names", "_bits", "_period_ns", "_sent_data", "_sent_ids", "counts", "frames")
+    __slots__ = ("_bits", "_codec", "_counters", "_names", "_period_ns", "_sent_data", "_sent_ids", "counts", "frames")
 
     def __init__(self, robots: Sequence[str], torque_scale: float, period_ns: int | Sequence[int]) -> None:
         if len(robots) > MAX_ROBOTS:

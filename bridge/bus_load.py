@@ -91,7 +91,9 @@ def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
 
     Raises ValueError for an identifier of more than 11 bits, or data of another length."""
     identifiers = np.array(can_ids, dtype=np.int64)
-    if len(data) != 8 * len(identifiers) or (identifiers.size and not 0 <= identifiers.min() <= identifiers.max() < 0x800):
+    if len(data) != 8 * len(identifiers) or (
+        identifiers.size and not 0 <= identifiers.min() <= identifiers.max() < 0x800
+    ):
         raise ValueError(f"{len(identifiers)} identifiers of 11 bits with 8 bytes each, not {len(data)} bytes in all")
     octets = np.frombuffer(data, np.uint8).reshape(-1, 8).T.astype(np.int64)
     head = identifiers << 7 | 8
@@ -99,7 +101,12 @@ def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
     for octet in (head >> 16, head >> 8 & 0xFF, head & 0xFF, *octets):
         crc = (crc << 8 & 0x7FFF) ^ _CRC_ARRAY[crc >> 7 ^ octet]
     # The 96 bits after the first two, as 12 bytes: 17 of the head, 64 of data, 15 of the CRC.
-    parts = (head >> 9 & 0xFF, head >> 1 & 0xFF, *(((before & 1) << 7 | octet >> 1) for before, octet in zip((head, *octets), (*octets, crc >> 7), strict=True)), crc & 0xFF)
+    parts = (
+        head >> 9 & 0xFF,
+        head >> 1 & 0xFF,
+        *(((before & 1) << 7 | octet >> 1) for before, octet in zip((head, *octets), (*octets, crc >> 7), strict=True)),
+        crc & 0xFF,
+    )
     state = np.where(head >> 17 & 1, 8 + 1, 2)
     total = np.full_like(head, 34 + 64 + _TAIL)
     for part in parts:

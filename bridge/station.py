@@ -8,9 +8,9 @@ import numpy as np
 
 from bridge.bridge import Bridge
 from bridge.bus import listen_command, open_bus
+from bridge.bus_load import bus_load, explain
 from bridge.canlog import CanLog
 from bridge.dbc import torque_dbc
-from bridge.bus_load import bus_load, explain
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
@@ -106,7 +106,11 @@ class Station:
         """Returns the share of a real bus that the frames so far take, in run time."""
         if not self._time_ns:
             return 0.0
-        return bus_load(self._bridge.frames * 1e9 / self._time_ns, self._plan.can.bitrate, self._bridge.bits / max(self._bridge.frames, 1))
+        return bus_load(
+            self._bridge.frames * 1e9 / self._time_ns,
+            self._plan.can.bitrate,
+            self._bridge.bits / max(self._bridge.frames, 1),
+        )
 
     def _copy(self, words: list[int], copies: list[Message]) -> None:
         if words:

@@ -44,7 +44,7 @@ class BlockGains:
         ahead = (plan.lead if lead is None else lead) * node.period_ns * 1e-9
         K_1, K_2 = block.k1 / block.sigma**2, block.k2 / block.sigma
         unit = np.eye(block.size)
-        m = np.linalg.inv(unit + ahead * K_2 + ahead**2 / 2 * K_1)
+        m: Array = np.asarray(np.linalg.inv(unit + ahead * K_2 + ahead**2 / 2 * K_1), dtype=np.float64)
         return cls(m @ K_1, m @ (K_2 + ahead * K_1), m @ plan.coupling[rows], m / block.sigma)
 
     def nu(self, e: Array, e_dot: Array) -> Array:

@@ -184,7 +184,7 @@ class TreeNode:
         if self._coupled:
             accelerations += law.of_rates @ all_rates
         if self._forces is None:
-            further = (accelerations, all_rates) if self._coupled else (accelerations,)
+            further: tuple[Array, ...] = (accelerations, all_rates) if self._coupled else (accelerations,)
         else:
             accelerations += law.of_forces @ forces
             further = (accelerations, all_rates, forces) if self._coupled else (accelerations, forces)

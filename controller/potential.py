@@ -57,8 +57,6 @@ class PairForces:
 
 def pairs_between(groups: list[range]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Returns the pairs (i < j) of robots that stand in different ones of `groups`, as two index arrays."""
-    pairs = [
-        (i, j) for at, group in enumerate(groups) for other in groups[at + 1 :] for i in group for j in other
-    ]
+    pairs = [(i, j) for at, group in enumerate(groups) for other in groups[at + 1 :] for i in group for j in other]
     array = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     return array[:, 0], array[:, 1]

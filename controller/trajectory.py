@@ -48,7 +48,9 @@ class Circle:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
         phi, rate = self.rate * t + self.phase, self.rate
         c, s = self.radius * cos(phi), self.radius * sin(phi)
-        return np.array([[self.centre[0] + c, self.centre[1] + s], [-rate * s, rate * c], [-(rate**2) * c, -(rate**2) * s]])
+        return np.array(
+            [[self.centre[0] + c, self.centre[1] + s], [-rate * s, rate * c], [-(rate**2) * c, -(rate**2) * s]]
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,7 @@ def desired_shape(shape: ShapePlan, weights: Sequence[int]) -> Array:
     points = np.array(shape.points, dtype=float).reshape(-1, 2)
     if shape.kind == "vectors":
         return points
-    return (node_matrix(weights) @ points)[:-1]
+    return np.asarray(node_matrix(weights) @ points, dtype=np.float64)[:-1]
 
 
 class Transformation:
@@ -63,7 +63,7 @@ class Transformation:
             desired.append(desired_shape(node.shape, node.weights))
         self.matrix: Array = np.vstack([*rows, mean[plan.root.index]])
         """Φ_M, (N, N); the paper's is this one times the 2×2 identity."""
-        self.inverse: Array = np.linalg.inv(self.matrix)
+        self.inverse: Array = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
         self.desired_shape: Array = np.vstack(desired)
         """Desired shape variables of all nodes, (N-1, 2)."""
 

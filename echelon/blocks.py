@@ -17,7 +17,7 @@ def make_blocks(law: Law, nodes: Sequence[NodePlan]) -> tuple[BlockPlan, ...]:
     offset = 0
     for node, sigma in zip(nodes, _time_scales(law, nodes), strict=True):
         has_groups = any(child >= nodes[0].index for child in node.children)
-        layer = "inter" if has_groups else "intra"
+        layer = "intra" if not has_groups else "inter" if node.parent is None else "middle"
         size = 2 * (len(node.children) - 1)
         blocks.append(BlockPlan(node.path or layer, layer, node.index, offset, size, sigma, np.eye(size), np.eye(size)))
         offset += size

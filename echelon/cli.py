@@ -42,7 +42,10 @@ def parser() -> argparse.ArgumentParser:
     def scenario(command: argparse.ArgumentParser) -> None:
         command.add_argument("scenario", help="a TOML file, or the name of a shipped scenario (paper, lab, …)")
         command.add_argument(
-            "--set", action="append", metavar="KEY=VALUE", help="override a value, e.g. law.epsilon=[0.1,0.2]; repeatable"
+            "--set",
+            action="append",
+            metavar="KEY=VALUE",
+            help="override a value, e.g. law.epsilon=[0.1,0.2]; repeatable",
         )
 
     run = add("run", "run a scenario; leaves a folder with recording, summary and report")

@@ -97,7 +97,8 @@ class NodePlan:
 class BlockPlan:
     """A block of the transformed state: the shape of one node (its `node`), or the centroid (`node` None).
 
-    It takes `size` numbers (x and y of each variable) from `offset` on; `layer` is `intra`, `inter` or `centroid`.
+    It takes `size` numbers (x and y of each variable) from `offset` on; `layer` is `intra`
+    (its children are robots), `middle`, `inter` (the root, over groups) or `centroid`.
     `sigma` [s] is its time scale; `k1`, `k2` are the gains K_fb1, K_fb2 before division by σ² and σ, (size, size).
     """
 

@@ -13,7 +13,7 @@ from echelon.values import CouplingGain, Finite, Flag, Fraction, Gain, Limit, Na
 from echelon.values import number_or_table as _number_or_table
 
 ChannelName = Literal["state", "group_state", "reference", "command", "*"]
-BLOCK_NAMES = ("intra", "inter", "centroid")
+BLOCK_NAMES = ("intra", "middle", "inter", "centroid")
 """Names of blocks and layers of blocks, which groups therefore cannot have."""
 
 

@@ -27,7 +27,7 @@ os.environ.setdefault(
     "(rx:(handover:app),tx:(handover:app),acc:(handover:app),net:(handover:app),app:(worker_threads:1))",
 )
 
-import zenoh  # noqa: E402  (after its environment)
+import zenoh
 
 Receive = Callable[[bytes], None]
 """Takes one payload, in Zenoh's thread.  While it runs nothing else is received, so it must wait for nothing that only
@@ -179,7 +179,7 @@ class Session:
 
     def close(self) -> None:
         """Ends the connection after delivering what was put.  Not to be called from a handler."""
-        self._session.close()
+        self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
         return self

@@ -121,7 +121,9 @@ def validate(arguments: argparse.Namespace) -> int:
         print(json.dumps(facts, indent=2))
     else:
         print(f"{arguments.scenario}: valid")
-        print(f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks")
+        print(
+            f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks"
+        )
         print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
         print(f"  CAN  {facts['can']}")
     return 0

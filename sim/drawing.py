@@ -74,7 +74,7 @@ def colour_of_block(plan: Plan, block: BlockPlan) -> str:
     """Returns a block's colour: its group's, or that of the shape over groups, or that of the centroid."""
     if block.node is None:
         return CENTROID
-    if block.layer == "inter":
+    if block.layer in ("middle", "inter"):
         return INTER
     return GROUPS[_top_group(plan, block.node) % len(GROUPS)]
 

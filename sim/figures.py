@@ -74,7 +74,11 @@ def transformed_state(blocks: Blocks, plan: Plan, width: float) -> str:
     with canvas(width, 1.75 * len(layers) + 0.5) as (figure, done):
         grid = figure.subplots(len(layers), 2, squeeze=False, sharey="row")
         for (layer, members), row in zip(layers, grid, strict=True):
-            title = {"intra": "Intra-group shape variables", "inter": "Inter-group shape variables"}.get(
+            title = {
+                "intra": "Intra-group shape variables",
+                "middle": "Shape variables of the layers between",
+                "inter": "Inter-group shape variables",
+            }.get(
                 layer, "Centroid"
             )
             for axes, log in zip(row, (False, True), strict=True):

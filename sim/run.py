@@ -186,7 +186,9 @@ def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str) -> dict[st
         "wall_time": outcome.wall_s,
         "startup_time": outcome.startup_s,
         "real_time_factor": simulated_s / outcome.wall_s if outcome.wall_s > 0 else None,
-        "ticks_per_second": simulated_s * 1e9 / plan.robots[0].period_ns / outcome.wall_s if outcome.wall_s > 0 else None,
+        "ticks_per_second": simulated_s * 1e9 / plan.robots[0].period_ns / outcome.wall_s
+        if outcome.wall_s > 0
+        else None,
         "messages": outcome.messages,
         "failure": outcome.failure,
     }
@@ -194,7 +196,8 @@ def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str) -> dict[st
     if runners:
         robots = {robot.name for robot in plan.robots}
         facts["processes"] = {
-            result.name: {"cpu_time": result.cpu_s, "resident_bytes": result.resident_bytes} for result in outcome.results
+            result.name: {"cpu_time": result.cpu_s, "resident_bytes": result.resident_bytes}
+            for result in outcome.results
         }
         facts["resident_bytes_robot_max"] = max(
             (result.resident_bytes for result in outcome.results if result.name in robots), default=None

@@ -86,7 +86,7 @@ class _Child:
         return b"".join(self.said)[-LAST_WORDS:].decode(errors="replace").strip()
 
 
-class RunFailed(Exception):
+class RunError(Exception):
     """The run cannot go on; the text says why."""
 
 
@@ -146,7 +146,7 @@ class Supervisor:
             self._until(lambda: all(child.result for child in members), limit_s, "not done")
             wall_s = time.monotonic() - start_s
             self.progress.phase = "finishing"
-        except RunFailed as error:
+        except RunError as error:
             failure = str(error)
         except KeyboardInterrupt:
             failure = "interrupted"
@@ -178,7 +178,7 @@ class Supervisor:
             self._children.append(_Child(spec, process, control, words, heard_s=time.monotonic()))
 
     def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
-        """Serves the children until `done`.  Raises RunFailed if one is lost, the run stalls, or the time is up."""
+        """Serves the children until `done`.  Raises RunError if one is lost, the run stalls, or the time is up."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         shown_s = 0.0
         while not done():
@@ -190,8 +190,10 @@ class Supervisor:
                 self._check_stall(now_s)
                 self._show(self.progress)
             if deadline_s is not None and now_s > deadline_s:
-                late = [child.name for child in self._children if not (child.ready if what == "not ready" else child.result)]
-                raise RunFailed(f"{what} after {timeout_s:g} s: {', '.join(late)}{self._words_of(late)}")
+                late = [
+                    child.name for child in self._children if not (child.ready if what == "not ready" else child.result)
+                ]
+                raise RunError(f"{what} after {timeout_s:g} s: {', '.join(late)}{self._words_of(late)}")
 
     def _serve(self, timeout_s: float) -> None:
         """Takes what children say on their control pipes and on standard error."""
@@ -240,7 +242,7 @@ class Supervisor:
                 progress.time_ns, progress.messages = news["time_ns"], news["messages"]
                 progress.states, progress.states_ns = news["states"], news["states_ns"]
                 if news["failure"] and progress.phase == "running":
-                    raise RunFailed(f"the recording failed: {news['failure']}")
+                    raise RunError(f"the recording failed: {news['failure']}")
             case "progress":
                 progress.can.update(rest[0])
             case "done":
@@ -257,7 +259,9 @@ class Supervisor:
                         self._hear_words(child)
                         if len(child.said) == before:
                             break
-                    raise RunFailed(f"lost {child.spec.kind} {child.name} ({_ending(child.process)}){self._words_of([child.name])}")
+                    raise RunError(
+                        f"lost {child.spec.kind} {child.name} ({_ending(child.process)}){self._words_of([child.name])}"
+                    )
 
     def _words_of(self, names: list[str]) -> str:
         said = [
@@ -282,20 +286,20 @@ class Supervisor:
             self._warned = True
             self.progress.note = f"stalled at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
         if still_s > self._stall_timeout_s:
-            raise RunFailed(
+            raise RunError(
                 f"stalled for {still_s:.0f} s at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
             )
 
     def _who_is_waited_for(self, now_s: float) -> str:
         """Says which processes everyone waits for: those that themselves wait for nobody and say nothing."""
-        silent = [child for child in self._children if child.spec.kind in ("recorder", "bridge") and now_s - child.heard_s > 2]
+        silent = [
+            child for child in self._children if child.spec.kind in ("recorder", "bridge") and now_s - child.heard_s > 2
+        ]
         if not silent:
             silent = [
                 child
                 for child in self._children
-                if child.spec.kind not in ("recorder", "bridge")
-                and child.result is None
-                and now_s - child.heard_s > 2
+                if child.spec.kind not in ("recorder", "bridge") and child.result is None and now_s - child.heard_s > 2
             ]
         if silent:
             return "everyone waits for " + ", ".join(
@@ -343,7 +347,7 @@ class Supervisor:
                     deadline_s = time.monotonic() + (GRACE_S if failure else 60.0)
                     while child.result is None and child.process.is_alive() and time.monotonic() < deadline_s:
                         self._serve(0.05)
-                except (RunFailed, OSError) as error:
+                except (RunError, OSError) as error:
                     failure = failure or str(error)
                 if child.result is not None and kind == "bridge":
                     sent["bridge"] = child.result.extra["messages"]
@@ -376,7 +380,9 @@ class Supervisor:
     def _outcome(self, failure: str | None, startup_s: float, wall_s: float) -> Outcome:
         results = [child.result for child in self._children if child.result is not None]
         extra: dict[str, dict[str, Any]] = {
-            child.spec.kind: child.result.extra for child in self._children if child.result is not None and child.result.extra
+            child.spec.kind: child.result.extra
+            for child in self._children
+            if child.result is not None and child.result.extra
         }
         recorded = extra.get("recorder", {})
         return Outcome(

@@ -36,4 +36,6 @@ def invented(plan: Plan, ticks: int, seed: int = 1) -> Iterator[Message]:
                 sizes[Channel.GROUP_STATE] = len(GROUP_FIELDS) + 2 * (node.robots - 1)
             for channel, size in sizes.items():
                 yield Message(channel, node.index, tick, time_ns, random.normal(size=size if tick else 0))
-    assert robots == 9 and plan.coupled and not plan.avoidance.enabled
+    assert robots == 9
+    assert plan.coupled
+    assert not plan.avoidance.enabled

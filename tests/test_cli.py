@@ -8,8 +8,8 @@ from pathlib import Path
 
 import cantools
 import pytest
-
 from runs import ROOT, echelon, plan_of, trace_of
+
 from sim.recording import read_links, read_metadata, read_scenario, read_trace
 
 QUICK = ("--set", "duration=0.2", "--set", "claims=[]")
@@ -77,7 +77,19 @@ def test_a_failed_claim_is_exit_code_1(tmp_path: Path) -> None:
 def test_a_diverged_run_says_so_and_its_summary_is_json(tmp_path: Path) -> None:
     links = 'links=[{source="**",receiver="*",channel="state",delay=0.02}]'
     done = echelon(
-        *("run", "paper", "--set", "duration=1.5", "--set", links, "--engine", "inprocess", "--quiet", "--out", tmp_path)
+        *(
+            "run",
+            "paper",
+            "--set",
+            "duration=1.5",
+            "--set",
+            links,
+            "--engine",
+            "inprocess",
+            "--quiet",
+            "--out",
+            tmp_path,
+        )
     )
     assert done.returncode == 1, done.stderr
     assert "not finite" in done.stdout
@@ -136,7 +148,7 @@ def test_export_writes_tables(folder: Path, tmp_path: Path) -> None:
     trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=0.2"))
     with (tmp_path / "robots.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == "t robot x y theta v omega ax ay tau_right tau_left".split()
+    assert list(rows[0]) == ["t", "robot", "x", "y", "theta", "v", "omega", "ax", "ay", "tau_right", "tau_left"]
     assert len(rows) == 9 * 201
     last = next(row for row in reversed(rows) if row["robot"] == "g1/r2")
     assert float(last["x"]) == trace.states[0][-1][0]

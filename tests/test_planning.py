@@ -109,7 +109,7 @@ def test_a_deep_and_mixed_tree():
     assert [(block.name, block.layer, block.offset, block.size) for block in plan.blocks] == [
         ("a/b", "intra", 0, 2),
         ("a/c", "intra", 2, 0),
-        ("a", "inter", 2, 2),
+        ("a", "middle", 2, 2),
         ("inter", "inter", 4, 2),
         ("centroid", "centroid", 6, 2),
     ]
@@ -500,3 +500,19 @@ def test_wildcards_match_what_trying_everything_matches(pattern, path):
 )
 def test_wildcards(pattern, path, fits):
     assert path_matches(pattern, path) == fits
+
+
+def test_the_root_and_the_layers_between_can_be_told_apart() -> None:
+    plan = load(SCENARIOS / "three_levels.toml", ['law.gains=[{block="inter",k1=3.0},{block="middle",k1=2.0}]'])[1]
+    assert {block.name: block.layer for block in plan.blocks if block.layer not in ("intra", "centroid")} == {
+        "west": "middle",
+        "south": "middle",
+        "east": "middle",
+        "inter": "inter",
+    }
+    assert {block.layer: block.k1[0, 0] for block in plan.blocks} == {
+        "intra": 1.0,
+        "middle": 2.0,
+        "inter": 3.0,
+        "centroid": 1.0,
+    }

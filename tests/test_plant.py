@@ -4,7 +4,7 @@ import time
 import warnings
 from dataclasses import replace
 from itertools import product
-from math import isinf, inf, isnan, nan
+from math import inf, isinf, isnan, nan
 
 import numpy as np
 import pytest

@@ -141,7 +141,7 @@ def test_long_payloads_arrive(stack: ExitStack, lockstep: bool) -> None:
     ],
 )
 def test_a_bad_endpoint_is_named(endpoint: str) -> None:
-    with pytest.raises(ValueError, match="endpoint|cannot listen") as caught:
+    with pytest.raises(ValueError, match=r"endpoint|cannot listen") as caught:
         Session(listen=[endpoint], connect=[], lockstep=True)
     assert endpoint in str(caught.value)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
+from runs import kill_session, plan_of, session_members, start_echelon, summary_of, trace_of, until
 
 from echelon.plan import Plan
-from runs import kill_session, plan_of, session_members, start_echelon, summary_of, trace_of, until
 from sim.process import ProcessSpec
 from sim.recording import read_trace, recover
 from sim.supervisor import Outcome, Progress, Supervisor

@@ -10,7 +10,18 @@ try:
 except ImportError:  # reported by the caller
     pass
 
-from bench.tree import BlockingPorts, COORDINATOR, LEADERS, ROBOTS, ROLES, Meter, Role, die_with_parent, play, run_processes
+from bench.tree import (
+    COORDINATOR,
+    LEADERS,
+    ROBOTS,
+    ROLES,
+    BlockingPorts,
+    Meter,
+    Role,
+    die_with_parent,
+    play,
+    run_processes,
+)
 
 REQUIRES = ("helics",)
 _STEPS = 4  # of HELICS time in a tick: state, group state, reference, command

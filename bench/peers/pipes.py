@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from bench.tree import BlockingPorts, COORDINATOR, FIELDS, HEADER, LEADERS, ROLES, Ports, Role, run_roles
+from bench.tree import COORDINATOR, FIELDS, HEADER, LEADERS, ROLES, BlockingPorts, Ports, Role, run_roles
 
 REQUIRES = ()
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.tree import BlockingPorts, GROUPS, ROBOTS, Ports, Role, run_roles
+from bench.tree import GROUPS, ROBOTS, BlockingPorts, Ports, Role, run_roles
 
 if TYPE_CHECKING:
     import zmq

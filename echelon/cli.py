@@ -81,6 +81,10 @@ def parser() -> argparse.ArgumentParser:
     scenario(validate)
     validate.add_argument("--json", action="store_true", help="print the facts as JSON")
 
+    analyse = add("analyse", "compute how much delay a scenario's control law bears, exactly, as it is sampled and held")
+    scenario(analyse)
+    analyse.add_argument("--json", action="store_true", help="print the facts as JSON")
+
     report = add("report", "write the report of a run, or a comparison of several")
     report.add_argument("runs", nargs="+", metavar="RUN", help="a run's folder")
     report.add_argument("--out", type=Path, metavar="FILE", help="where to write it (default: report.html)")

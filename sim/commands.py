@@ -227,3 +227,45 @@ def dbc(arguments: argparse.Namespace) -> int:
     robots = [robot.path for robot in plan.robots]
     sys.stdout.write(torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns))
     return 0
+
+
+def analyse(arguments: argparse.Namespace) -> int:
+    """`echelon analyse`"""
+    from controller.law import BlockGains
+    from controller.sampled import delay_margin, largest_stable_delay, spectral_radius
+
+    _, plan = scenario_of(arguments)
+    period_s = plan.root.period_ns / 1e9
+    try:
+        largest = largest_stable_delay(plan, 500)
+        radii = {k: spectral_radius(plan, k) for k in ((0,) if largest is None else (largest, largest + 1))}
+    except ValueError as error:
+        raise UsageError(f"{arguments.scenario}: {error}") from None
+    margins = {}
+    for block in plan.blocks:
+        if block.size:
+            gains = BlockGains.of(plan, block, 0.0)
+            margin = delay_margin(float(gains.K_1[0, 0]), float(gains.K_2[0, 0]))
+            margins[block.name] = {"sigma": block.sigma, "delay_margin": margin}
+    if arguments.json:
+        facts = {
+            "scenario": plan.name,
+            "period": period_s,
+            "blocks": margins,
+            "largest_stable_delay": None if largest is None else largest * period_s,
+            "spectral_radius": radii,
+        }
+        print(json.dumps(facts, indent=2))
+        return 0 if largest is not None else 1
+    print(f"{plan.name}: how old robots' states may be when their leaders use them")
+    for name, row in margins.items():
+        margin_ms = f"{1e3 * row['delay_margin']:.4g} ms"
+        print(f"  {name:<12} σ {row['sigma']:<6.4g} s   margin of the block alone, in continuous time: {margin_ms}")
+    how = f"all blocks together, sampled and held for {1e3 * period_s:g} ms"
+    if largest is None:
+        print(f"  {how}: unstable without any delay")
+        return 1
+    print(f"  {how}: stable up to {largest} ticks, {1e3 * largest * period_s:g} ms")
+    for k, radius in radii.items():
+        print(f"    {k} ticks: spectral radius {radius:.6f}, {'settles' if radius < 1 else 'does not settle'}")
+    return 0

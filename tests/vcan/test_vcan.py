@@ -179,3 +179,33 @@ def test_multicast_beside_it() -> None:
         frame = receiver.recv(10.0)
         assert frame is not None
         assert (frame.can_id, frame.data) == (0x101, b"torque")
+
+
+def test_a_whole_run_as_processes_is_on_the_bus(tmp_path: Path) -> None:
+    """Thirteen members, recorder and bridge; candump beside them hears every torque, and cantools reads it in N m."""
+    folder = tmp_path / "run"
+    run_command = [sys.executable, "-m", "echelon.cli", "run", "lab", "--set", "duration=1", "--set", "claims=[]"]
+    run_command += ["--can", "socketcan:vcan0", "--no-report", "--quiet", "--out", str(folder)]
+    listen = ["candump", "-L", "vcan0", "-n", "900", "-T", "60000"]
+    with subprocess.Popen(listen, stdout=subprocess.PIPE, text=True) as candump:
+        limit = time.monotonic() + 20
+        while not somebody_listens() and time.monotonic() < limit:
+            assert candump.poll() is None
+        done = subprocess.run(run_command, capture_output=True, text=True, timeout=150, check=False)
+        assert done.returncode == 0, done.stderr
+        heard = candump.communicate(timeout=90)[0].splitlines()
+    logged = [line.split()[2] for line in (folder / "can.log").read_text().splitlines()]
+    assert len(logged) == 9 * 100
+    assert [line.split()[2] for line in heard] == logged
+    decode = [sys.executable, "-m", "cantools", "decode", "--single-line", str(folder / "torque.dbc")]
+    decoded = subprocess.run(
+        decode, input="\n".join(heard) + "\n", capture_output=True, text=True, timeout=60, check=True
+    ).stdout.splitlines()
+    codec = NativeCodec(SCALE)
+    for line, frame in zip(decoded, logged, strict=True):
+        can_id, data = frame.split("#")
+        torque = codec.decode(int(can_id, 16), bytes.fromhex(data))
+        assert isinstance(torque, Torque)
+        found = re.search(r"tau_right: (\S+) Nm, tau_left: (\S+) Nm,", line)
+        assert found, line
+        assert [float(text) for text in found.groups()] == pytest.approx([torque.tau_right, torque.tau_left])

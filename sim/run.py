@@ -179,7 +179,8 @@ def _note(progress: Progress, recording: Any, station: Any) -> None:
 
 def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str) -> dict[str, Any]:
     common_ns, _ = outcome.trace.common()
-    simulated_s = int(common_ns[-1]) / 1e9 if len(common_ns) else 0.0
+    # Robots move on through the period that begins at the last instant: so much was simulated.
+    simulated_s = (int(common_ns[-1]) + plan.robots[0].period_ns) / 1e9 if len(common_ns) else 0.0
     facts: dict[str, Any] = {
         "engine": engine,
         "clock": clock,

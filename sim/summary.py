@@ -95,7 +95,11 @@ def _lines(summary: Mapping[str, Any]) -> Iterator[str]:
     sent, lost = (sum(link[key] for link in summary["links"]) for key in ("sent", "lost"))
     age = max((link["age_max"] for link in summary["links"]), default=0.0)
     yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
+    if (can := summary["can"]).get("fit"):
+        yield f"  CAN      {can['frames']} frames, {can['clipped']} clipped; {can['fit']}"
     run = summary["run"]
+    if run.get("clock") == "wall" and run.get("stages"):
+        yield f"  late     {run['late_stages']} of {run['stages']} stages, at most {number(run['latest'], 's')}"
     if "wall_time" in run:
         yield f"  wall     {number(run['wall_time'], 's')}, {number(run.get('real_time_factor'))} times real time"
     yield f"  digest   {summary['trace_digest']}"

@@ -120,7 +120,8 @@ def compare(names: list[str], ticks: int, repeat: int) -> tuple[dict[str, list[M
             if not installed(module):
                 failures[name] = "not installed"
                 continue
-            print(f"\r\x1b[K{number + 1}/{repeat} {name}", end="", file=sys.stderr, flush=True)
+            if sys.stderr.isatty():
+                print(f"\r\x1b[K{number + 1}/{repeat} {name}", end="", file=sys.stderr, flush=True)
             try:
                 found = measure(getattr(importlib.import_module(module), function), share)
             except (RuntimeError, KeyError) as error:
@@ -130,7 +131,8 @@ def compare(names: list[str], ticks: int, repeat: int) -> tuple[dict[str, list[M
                 failures[name] = "failed: its final values are not those expected"
                 continue
             runs[name].append(found)
-    print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
     return runs, failures
 
 

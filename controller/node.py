@@ -10,7 +10,7 @@ belongs to the lowest node that has both below it: that node computes its ∇f f
 Above that node the pair's two forces cancel in every mean, below it they are handed down.
 
 All of the law is linear in what a node knows, but for the forces.  So its matrices are multiplied out once
-(`NodeLaw`), and a period costs one product for each thing that was heard.
+(`NodeLaw`), and a period costs one product upwards and one downwards, whatever the law.
 """
 
 from collections.abc import Sequence
@@ -29,16 +29,20 @@ from echelon.role import Input, Stage
 
 @dataclass(frozen=True, slots=True)
 class NodeLaw:
-    """The law of one node as matrices onto its children's accelerations, all of them behind Φ_node⁻¹ ⊗ I.
+    """The law of one node as matrices.  With n children, whose positions and velocities (x, y, vx, vy) make up s (4 n),
+    N robots in all and R below the node:
 
-    With n children, N robots in all and R below the node: of its errors (4 n: e and ė of each variable, the centroid
-    last), of the error rates of all blocks (2 N), of the forces on its robots (2 R), of its centroid's acceleration (2).
+        (centroid, its velocity, error rates of the own shape) = up @ s
+        accelerations of the children = down @ (s, c, error rates of all blocks) + of_forces @ forces + constant
+
+    where c is the acceleration of the own centroid (2), or for the root (z_cd, ż_cd, z̈_cd) (6).  The rates (2 N) are
+    left out where no block is coupled.
     """
 
-    of_error: Array
-    of_rates: Array
+    up: Array
+    down: Array
     of_forces: Array
-    of_centroid: Array
+    constant: Array
 
     @classmethod
     def of(cls, plan: Plan, node: NodePlan) -> "NodeLaw":
@@ -47,22 +51,35 @@ class NodeLaw:
         blocks = [(plan.block_of(node.index), slice(0, size - 2))]
         if node.parent is None:
             blocks.append((plan.blocks[-1], slice(size - 2, size)))
-        errors = np.arange(4 * count).reshape(count, 2, 2)
+        # An error is (e_x, e_y, ė_x, ė_y) for each variable, the centroid last, as Φ_node makes it of s.
+        error = np.arange(4 * count).reshape(count, 2, 2)
         nu_of_error = np.zeros((size, 4 * count))
         nu_of_rates = np.zeros((size, 2 * len(plan.robots)))
         nu_of_f_pot = np.zeros((size, size))
         for block, rows in blocks:
             gains = BlockGains.of(plan, block)
             variables = range(rows.start // 2, rows.stop // 2)
-            nu_of_error[rows, errors[variables, 0].ravel()] = -gains.K_1
-            nu_of_error[rows, errors[variables, 1].ravel()] = -gains.K_2
+            nu_of_error[rows, error[variables, 0].ravel()] = -gains.K_1
+            nu_of_error[rows, error[variables, 1].ravel()] = -gains.K_2
             nu_of_rates[rows] = -gains.K_coupling
             nu_of_f_pot[rows, rows] = gains.K_pot
         phi = node_matrix(node.weights)
+        error_of_s = np.kron(phi, np.eye(4))
+        desired = np.zeros((count, 4))
+        desired[:-1, :2] = desired_shape(node.shape, node.weights)
         means = np.repeat(np.eye(count), node.weights, axis=1) / np.array(node.weights)[:, None]
-        f_pot = np.kron(phi @ means, np.eye(2))  # forces on robots to F_pot of this node, label tp
+        f_pot_of_forces = np.kron(phi @ means, np.eye(2))  # label tp
         back = np.kron(np.linalg.inv(phi), np.eye(2))
-        return cls(back @ nu_of_error, back @ nu_of_rates, back @ nu_of_f_pot @ f_pot, back[:, -2:].copy())
+        of_error, of_centroid = back @ nu_of_error, back[:, -2:]
+        if node.parent is None:
+            of_centroid = np.hstack([-of_error[:, error[-1].ravel()], of_centroid])
+        of_rates = back @ nu_of_rates if plan.coupled else np.zeros((size, 0))
+        return cls(
+            np.vstack([error_of_s[-4:], error_of_s[error[:-1, 1].ravel()]]),
+            np.hstack([of_error @ error_of_s, of_centroid, of_rates]),
+            back @ nu_of_f_pot @ f_pot_of_forces,
+            -of_error @ desired.ravel(),
+        )
 
 
 class TreeNode:
@@ -75,21 +92,15 @@ class TreeNode:
         count = len(node.children)
         self.index = index
         self._node, self._is_root, self._coupled = node, parent is None, plan.coupled
-        self._phi = node_matrix(node.weights)
         self._law = NodeLaw.of(plan, node)
         self._trajectory = make_trajectory(plan.trajectory) if parent is None else None
-        self._centroid_acceleration: Array = np.zeros(2)
+        self._z_cd: Array = np.zeros(6)
         self._child_is_node = [child in by_index for child in node.children]
+        self._has_groups, self._has_robots = any(self._child_is_node), not all(self._child_is_node)
+        self._s: Array | None = None  # of the children, once all of them have been heard
 
-        # What the children said last: position and velocity of each; what is wanted; the difference, transformed.
-        self._children = np.zeros((count, 4))
-        self._desired = np.zeros((count, 4))
-        self._desired[:-1, :2] = desired_shape(node.shape, node.weights)
-        self._z = self._error = np.zeros((count, 4))
-        self._known = False
-
-        # Error rates of all blocks below, this node's own last (the root: then the centroid's); positions of all robots
-        # below; and where each child's part of them stands.
+        # Error rates of all blocks below (the root: then of its own and of the centroid), positions of all robots below,
+        # and where each child's part of them stands.
         self._rates_at: list[tuple[int, int]] = []
         self._robots_at: list[tuple[int, int]] = []
         rates = robots = 0
@@ -99,7 +110,8 @@ class TreeNode:
             self._robots_at.append((robots, robots + weight))
             rates, robots = rates + more, robots + weight
         self._own_rates = rates
-        self._rates = np.zeros((rates + 2 * (count - (parent is not None))) if plan.coupled else 0)
+        self._rates = np.zeros(rates + (2 * count if plan.coupled and parent is None else 0))
+        self._below = [self._rates] if rates else []
         self._positions = np.zeros((robots, 2))
         self._no_forces = np.zeros(2 * robots)
         self._forces: PairForces | None = None
@@ -115,7 +127,7 @@ class TreeNode:
             self._forces_at = self._all_rates_at + (2 * len(plan.robots) if plan.coupled else 0)
             self._forces_at += 2 * (node.first_robot - parent.first_robot)
             self._parent_period_ns = parent.period_ns
-        self._all_rates = slice(self._all_rates_at, self._all_rates_at + 2 * len(plan.robots))
+        self._all_rates = slice(self._all_rates_at, self._all_rates_at + (2 * len(plan.robots) if plan.coupled else 0))
 
         deepest = max(other.depth for other in plan.nodes)
         kinds = [Channel.GROUP_STATE if is_node else Channel.STATE for is_node in self._child_is_node]
@@ -128,35 +140,36 @@ class TreeNode:
 
     def _gather(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the children's states; returns the group's state where the parent wants one now."""
-        self._known = all(message is not None for message in heard)
-        if not self._known:
+        said = [message.values for message in heard if message is not None]
+        if len(said) < len(heard):
+            self._s = None
             return self._group_state(time_ns, NULL)
-        for at, message in enumerate(heard):
-            assert message is not None
-            values = message.values
-            self._children[at] = values[:4]
+        self._s = s = np.concatenate([values[:4] for values in said])
+        if self._forces is not None or self._has_groups:
+            self._gather_rest(said)
+        own = self._law.up @ s
+        if self._trajectory is not None:
+            self._z_cd = self._trajectory.at(time_ns * 1e-9).ravel()
+            if self._coupled:
+                self._rates[self._own_rates : -2] = own[4:]
+                self._rates[-2:] = own[2:4] - self._z_cd[2:4]
+            return ()
+        parts = [own[:4], *self._below, own[4:]] if self._coupled else [own[:4]]
+        if self._forces is not None:
+            parts.append(self._positions.ravel())
+        return self._group_state(time_ns, np.concatenate(parts))
+
+    def _gather_rest(self, said: list[Values]) -> None:
+        """Takes what else the children say: error rates of blocks and positions of robots below them."""
+        for at, values in enumerate(said):
+            first_robot, last_robot = self._robots_at[at]
             if self._child_is_node[at]:
                 first, last = self._rates_at[at]
                 self._rates[first:last] = values[4 : 4 + last - first]
                 if self._forces is not None:
-                    first_robot, last_robot = self._robots_at[at]
                     self._positions[first_robot:last_robot] = values[4 + last - first :].reshape(-1, 2)
             elif self._forces is not None:
-                self._positions[self._robots_at[at][0]] = values[:2]
-        if self._trajectory is not None:
-            z_cd = self._trajectory.at(time_ns * 1e-9)
-            self._desired[-1] = z_cd[:2].ravel()
-            self._centroid_acceleration = z_cd[2]
-        self._z = self._phi @ self._children
-        self._error = self._z - self._desired
-        if self._coupled:
-            own = self._error[:, 2:].ravel()
-            self._rates[self._own_rates :] = own if self._is_root else own[:-2]
-        if self._is_root:
-            return ()
-        if self._forces is None:
-            return self._group_state(time_ns, np.concatenate((self._z[-1], self._rates)))
-        return self._group_state(time_ns, np.concatenate((self._z[-1], self._rates, self._positions.ravel())))
+                self._positions[first_robot] = values[:2]
 
     def _group_state(self, time_ns: int, values: Values) -> tuple[Message, ...]:
         if self._is_root or time_ns % self._parent_period_ns:
@@ -165,36 +178,34 @@ class TreeNode:
 
     def _steer(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the parent's reference; returns references and commands for the children."""
-        reference = heard[0] if heard else None
-        if not self._known or (reference is None and not self._is_root):
+        law, s = self._law, self._s
+        if self._is_root:
+            c, all_rates = self._z_cd, self._rates
+        elif heard[0] is not None:
+            reference = heard[0].values
+            c = reference[self._acceleration_at : self._acceleration_at + 2]
+            all_rates = reference[self._all_rates]
+        else:
+            s = None
+        if s is None:
             return self._down(time_ns, NULL, NULL)
-        law = self._law
-        all_rates, forces = self._rates, self._no_forces
-        if self._forces is not None and (near := self._forces(self._positions)) is not None:
-            forces = near.ravel()
-        if reference is None:
-            accelerations = law.of_error @ self._error.ravel() + law.of_centroid @ self._centroid_acceleration
-        else:
-            values = reference.values
-            at = self._acceleration_at
-            accelerations = law.of_error @ self._error.ravel() + law.of_centroid @ values[at : at + 2]
-            all_rates = values[self._all_rates]
-            if self._forces is not None:
-                forces = forces + values[self._forces_at : self._forces_at + forces.size]
-        if self._coupled:
-            accelerations += law.of_rates @ all_rates
+        accelerations = law.down @ np.concatenate((s, c, all_rates)) + law.constant
         if self._forces is None:
-            further: tuple[Array, ...] = (accelerations, all_rates) if self._coupled else (accelerations,)
+            further: tuple[Array, ...] = (accelerations, all_rates)
         else:
+            near = self._forces(self._positions)
+            forces = self._no_forces if near is None else near.ravel()
+            if not self._is_root:
+                forces = forces + reference[self._forces_at : self._forces_at + forces.size]
             accelerations += law.of_forces @ forces
-            further = (accelerations, all_rates, forces) if self._coupled else (accelerations, forces)
-        return self._down(time_ns, np.concatenate(further), accelerations)
+            further = (accelerations, all_rates, forces)
+        return self._down(time_ns, np.concatenate(further) if self._has_groups else NULL, accelerations)
 
     def _down(self, time_ns: int, reference: Values, command: Values) -> tuple[Message, ...]:
         number = time_ns // self._node.period_ns
         messages = []
-        if any(self._child_is_node):
+        if self._has_groups:
             messages.append(Message(Channel.REFERENCE, self.index, number, time_ns, reference))
-        if not all(self._child_is_node):
+        if self._has_robots:
             messages.append(Message(Channel.COMMAND, self.index, number, time_ns, command))
         return tuple(messages)

@@ -81,7 +81,9 @@ def parser() -> argparse.ArgumentParser:
     scenario(validate)
     validate.add_argument("--json", action="store_true", help="print the facts as JSON")
 
-    analyse = add("analyse", "compute how much delay a scenario's control law bears, exactly, as it is sampled and held")
+    analyse = add(
+        "analyse", "compute how much delay a scenario's control law bears, exactly, as it is sampled and held"
+    )
     scenario(analyse)
     analyse.add_argument("--json", action="store_true", help="print the facts as JSON")
 

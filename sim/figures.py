@@ -78,9 +78,7 @@ def transformed_state(blocks: Blocks, plan: Plan, width: float) -> str:
                 "intra": "Intra-group shape variables",
                 "middle": "Shape variables of the layers between",
                 "inter": "Inter-group shape variables",
-            }.get(
-                layer, "Centroid"
-            )
+            }.get(layer, "Centroid")
             for axes, log in zip(row, (False, True), strict=True):
                 for series in members:
                     colour = colour_of_block(plan, series.block)

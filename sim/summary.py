@@ -117,10 +117,15 @@ def _broken(trace: Trace, end_ns: int | None) -> list[str]:
     period of the coordinator before it."""
     plan = trace.plan
     reasons = []
+    lost: list[tuple[int, str]] = []
     for robot, states, times_ns in zip(plan.robots, trace.states, trace.times_ns, strict=True):
         wrong = np.flatnonzero(~np.isfinite(states).all(axis=1))
         if wrong.size:
-            reasons.append(f"{robot.name}: a state is not finite from {times_ns[wrong[0]] / 1e9:g} s on")
+            lost.append((int(times_ns[wrong[0]]), robot.name))
+    if lost:
+        first_ns, name = min(lost)
+        others = f", as of {len(lost)} robots in the end" if len(lost) > 1 else ""
+        reasons.append(f"{name}: a state is not finite from {first_ns / 1e9:g} s on{others}")
     wanted = plan.duration_ns
     needed = wanted - plan.root.period_ns
     early = [

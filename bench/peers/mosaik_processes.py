@@ -151,7 +151,7 @@ def _simulator() -> None:
         def _finish(self) -> None:
             self._meter.report(folder, self._role.name, self._value)
 
-    mosaik_api_v3.start_simulation(Simulator())
+    mosaik_api_v3.start_simulation(Simulator(), configure_logging=False)
 
 
 def _level(role: Role) -> int:

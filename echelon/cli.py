@@ -107,12 +107,13 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parsed = parser().parse_args(arguments)
-    commands = import_module(COMMANDS)
     try:
-        return int(getattr(commands, parsed.command)(parsed))
-    except commands.UsageError as error:
-        print(f"echelon: {error}", file=sys.stderr)
-        return 2
+        commands = import_module(COMMANDS)
+        try:
+            return int(getattr(commands, parsed.command)(parsed))
+        except commands.UsageError as error:
+            print(f"echelon: {error}", file=sys.stderr)
+            return 2
     except BrokenPipeError:  # a reader such as head that has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0

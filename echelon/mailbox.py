@@ -6,6 +6,7 @@ that runs has heard the same whatever the order, the speed or the process in whi
 """
 
 from dataclasses import dataclass, field
+from math import gcd
 from typing import Final
 
 from echelon.link import Link, LinkCounts
@@ -13,8 +14,12 @@ from echelon.messages import Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Role
 
-SLACK: Final = 64
+LEAD: Final = 256
+"""Periods by which a role in a lockstep may be ahead of any of its sources.  A link that is late or loses would let it run
+on without them, and what it sends would pile up in front of them."""
+SLACK: Final = 4 * LEAD
 """Messages that an input may hold beyond those in flight before it looks for lost ones among them."""
+_NO_LIMIT: Final = 1 << 62
 
 
 @dataclass(slots=True)
@@ -26,24 +31,29 @@ class _Slot:
     period_ns: int
     many: int
     """More messages than this cannot all be in flight: those that the link loses are then forgotten."""
+    lead_ns: int
+    """So far the role may be ahead of the newest message that has come, whatever the link does with it."""
     current: Message | None = None
     in_use: int = -1
     newer: dict[int, Message] = field(default_factory=dict)
+    newest: int = -1
     wanted: int = -1
 
 
 class Mailbox:
-    """All inputs of one role."""
+    """All inputs of one role; with `paced`, it misses something too while it is `LEAD` ahead of a source."""
 
-    def __init__(self, role: Role, plan: Plan) -> None:
+    def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
         members = plan.members
         receiver = members[role.index].name
+        tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._slots = {
             (link.channel, link.source): _Slot(
                 Link(link, plan.seed, members[link.source].name, receiver),
                 link.ideal,
                 link.period_ns,
                 2 * (link.delay_max_ns // link.period_ns) + SLACK,
+                max(LEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns) if paced else _NO_LIMIT,
             )
             for link in plan.links_into(role.index)
         }
@@ -61,12 +71,20 @@ class Mailbox:
             self.unexpected += 1
         elif message.sequence > slot.in_use:
             slot.newer[message.sequence] = message
+            if message.sequence > slot.newest:
+                slot.newest = message.sequence
 
     def missing(self, stage: int, time_ns: int) -> list[Link]:
         """Returns the links whose message in use at `time_ns` has not come; empty if the stage can run."""
         waiting = []
         for slot in self._stage_slots[stage]:
-            slot.wanted = number = time_ns // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
+            if slot.ideal:
+                number = time_ns // slot.period_ns
+            else:
+                number = slot.link.newest(time_ns)
+                if slot.newest * slot.period_ns < time_ns - slot.lead_ns:
+                    waiting.append(slot.link)
+                    continue
             if number > slot.in_use and number not in slot.newer:
                 waiting.append(slot.link)
         return waiting
@@ -86,9 +104,10 @@ class Mailbox:
                     number = self._newest_come(slot, time_ns)
                 message = newer.pop(number, None)
                 if message is not None:
+                    if newer:  # those that this one overtakes
+                        for overtaken in range(slot.in_use + 1, number):
+                            newer.pop(overtaken, None)
                     slot.current, slot.in_use = message, number
-                    if newer:
-                        slot.newer = {sequence: newer[sequence] for sequence in newer if sequence > number}
                 elif len(newer) > slot.many:
                     slot.newer = {each: newer[each] for each in newer if slot.link.fate(each) is not None}
             current = slot.current

@@ -2,7 +2,11 @@
 
 In a lockstep the role moves as messages come: the handler of a message puts it into the mailbox and runs every stage that
 misses nothing any more, in Zenoh's own thread.  Between messages the process sleeps.  The main thread wakes only for what
-may wait for others: sending batches to those who watch, and long stretches without waiting.
+may wait for others, sending batches to those who watch, and for long stretches without waiting.
+
+Zenoh's thread also does the sending, so it must never wait: not for the main thread (what comes while that one moves the
+role is put aside for it), and not for room to put a message (`mailbox.LEAD` bounds what may be on the way to a receiver
+that reads nothing, and the session has room for that).
 
 On a wall clock the main thread waits for each stage's inputs until the stage's deadline, counts what was late, and goes on
 with the newest it has.
@@ -10,6 +14,7 @@ with the newest it has.
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import gcd
@@ -29,7 +34,7 @@ BATCH_BYTES: Final = 12_000
 MAX_BATCHES: Final = 4
 """So many batches may wait for a slow watcher before the role waits, too."""
 STRETCH: Final = 64
-"""Stages run in Zenoh's thread without a pause; what goes on for longer is the main thread's, where a put may wait."""
+"""Stages run without a pause; what goes on for longer in Zenoh's thread is the main thread's, so that others get a word."""
 
 OnWait = Callable[[int, list[int]], None]
 """(instant [ns], indices of the members waited for)"""
@@ -88,7 +93,7 @@ class Runner:
         members = plan.members
         member = members[role.index]
         self.role, self.plan = role, plan
-        self.mailbox = Mailbox(role, plan)
+        self.mailbox = Mailbox(role, plan, paced=virtual)
         self.counts = RunnerCounts()
         channels = sorted({link.channel for link in plan.links if link.source == role.index})
         self._puts = {channel: session.publisher(data_key(run, member.path, channel)).put for channel in channels}
@@ -99,8 +104,12 @@ class Runner:
         self._tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._stages = list(enumerate(role.stages))
 
+        self._stopping = False  # asked to, by a signal
+        self._idle = False  # the main thread waits and may be interrupted
+
         # State of a lockstep.  Whoever holds the lock may touch the mailbox and move the role.
         self._lock = threading.Lock()
+        self._aside: deque[bytes] = deque()  # what came while the main thread had the lock
         self._wake = threading.Event()  # there is something for the main thread
         self._in_handler = False  # the handler may move the role; otherwise that is the main thread's turn
         self._time_ns = 0
@@ -122,14 +131,16 @@ class Runner:
         last_moved = -1
         while True:
             with self._lock:
+                self._take_aside()
                 self._in_handler = not self._advance()
+                finished = self._finished  # from here on the handler may finish it, too, with a batch still to send
             if self._failure is not None:
                 raise self._failure
             if self._watch is not None:
                 self._watch.send()
-            if self._finished:
+            if finished:
                 return
-            if self._in_handler and not self._wake.wait(STALL_S):
+            if not self._wait_for_wake():
                 with self._lock:
                     missing = [] if self._finished else self.mailbox.missing(self._at, self._time_ns)
                     moved, time_ns = self._moved, self._time_ns
@@ -140,17 +151,37 @@ class Runner:
                 last_moved = moved
             self._wake.clear()
 
+    def _wait_for_wake(self) -> bool:
+        """Waits until there is something for the main thread; returns False if that takes too long."""
+        self._idle = True
+        if self._stopping:
+            raise SystemExit(0)
+        woken = not self._in_handler or self._wake.wait(STALL_S)
+        self._idle = False
+        return woken
+
     def _receive(self, payload: bytes) -> None:
         """Takes a payload in Zenoh's thread, and moves the role as far as that lets it."""
-        with self._lock:
-            try:
-                self._deliver(payload)
-                if self._in_handler and self._advance():
-                    self._in_handler = False
-                    self._wake.set()
-            except BaseException as error:  # nobody above would learn of it
-                self._failure, self._in_handler = error, False
+        if not self._lock.acquire(blocking=False):
+            self._aside.append(payload)
+            self._wake.set()
+            return
+        try:
+            if self._aside:
+                self._take_aside()
+            self._deliver(payload)
+            if self._in_handler and self._advance():
+                self._in_handler = False
                 self._wake.set()
+        except BaseException as error:  # nobody above would learn of it
+            self._failure, self._in_handler = error, False
+            self._wake.set()
+        finally:
+            self._lock.release()
+
+    def _take_aside(self) -> None:
+        while self._aside:
+            self._deliver(self._aside.popleft())
 
     def _advance(self) -> bool:
         """Runs stages until one misses something; returns True if it stopped for another reason."""
@@ -185,7 +216,7 @@ class Runner:
         levels = max(node.depth for node in self.plan.nodes) * 2 + 3
         mailbox, counts, take = self.mailbox, self.counts, self._inbox.take
         for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
-            _sleep_until(start_ns + time_ns)
+            self._sleep_until(start_ns + time_ns)
             for number, stage in self._stages:
                 if time_ns % stage.period_ns:
                     continue
@@ -203,12 +234,24 @@ class Runner:
                 if stage.level:
                     counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns)
                 self._run_stage(number, stage, time_ns)
-            self.flush()
+            if self._watch is not None:
+                self._watch.close()
+                self._watch.send()
 
-    def flush(self) -> None:
-        """Sends what is held back for those who watch."""
+    def stop(self) -> None:
+        """Breaks the run off with SystemExit in the main thread, between two messages; for a signal handler there."""
+        self._stopping = True
+        if self._idle:
+            self._idle = False
+            raise SystemExit(0)
+
+    def finish(self) -> None:
+        """Moves the role no more, and sends what is held back for those who watch."""
+        with self._lock:
+            self._finished = True
+            if self._watch is not None:
+                self._watch.close()
         if self._watch is not None:
-            self._watch.close()
             self._watch.send()
 
     def _run_stage(self, number: int, stage: Stage, time_ns: int) -> bool:
@@ -232,9 +275,12 @@ class Runner:
             return
         self.mailbox.deliver(message)
 
-
-def _sleep_until(instant_ns: int) -> None:
-    """Sleeps until an instant of `time.monotonic_ns`, if that is still to come."""
-    left_ns = instant_ns - time.monotonic_ns()
-    if left_ns > 0:
-        time.sleep(left_ns * 1e-9)
+    def _sleep_until(self, instant_ns: int) -> None:
+        """Sleeps until an instant of `time.monotonic_ns`, if that is still to come."""
+        self._idle = True
+        if self._stopping:
+            raise SystemExit(0)
+        left_ns = instant_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns * 1e-9)
+        self._idle = False

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
-# Read once, when Zenoh is loaded.  A second worker thread would be one more hand-over for every message.
+# Read once, when the first session opens.  A second worker thread would be one more hand-over for every message.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
     "(rx:(handover:app),tx:(handover:app),acc:(handover:app),net:(handover:app),app:(worker_threads:1))",
@@ -57,8 +57,9 @@ class Inbox:
         """Returns and forgets all that was received; waits for something if there is nothing, `timeout_s` at most."""
         payloads = self._payloads
         if not payloads and timeout_s != 0:
-            self._some.wait(timeout_s)
-        self._some.clear()
+            self._some.clear()  # before looking again: one that comes now sets it anew
+            if not payloads:
+                self._some.wait(timeout_s)
         taken = [payloads.popleft() for _ in range(len(payloads))]
         self._room.set()
         return taken
@@ -131,9 +132,17 @@ class Session:
     own links and no further.  Raises ValueError for an endpoint that is none, or cannot be listened on.
     """
 
-    def __init__(self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> None:
+    def __init__(
+        self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool, own_sender: bool = False
+    ) -> None:
+        """`own_sender` is for a process that holds an inbox in lockstep and puts, too: sending must go on while receiving
+        stands still.  It holds for the process, and only before its first session."""
         if lockstep:
             _prefer_throughput()
+        if own_sender:
+            os.environ["ZENOH_RUNTIME"] = os.environ["ZENOH_RUNTIME"].replace(
+                "tx:(handover:app)", "tx:(worker_threads:1)"
+            )
         self._lockstep = lockstep
         self._session = _open(listen, connect, lockstep)
         self._kept: list[object] = []  # what is declared lives as long as the session
@@ -233,6 +242,11 @@ def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zeno
     if lockstep:
         # Whoever is stopped is waited for, with all that was put for it; the run's supervisor decides when to give up.
         settings["transport/link/tx/lease"] = LEASE_MS
+        # A put in Zenoh's thread must find room: who waits there keeps the room from being made.  So 1 MiB per link, all of
+        # it from the start, for a queue that grows as needed has been seen to stall.
+        for queue in ("control", "data"):
+            settings[f"transport/link/tx/queue/size/{queue}"] = 16
+        settings["transport/link/tx/queue/allocation/mode"] = "init"
         settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = LEASE_MS * 1000
     config = zenoh.Config()
     for name, value in settings.items():

@@ -38,7 +38,7 @@ def scenario_of(arguments: argparse.Namespace) -> tuple[Scenario, Plan]:
 def run(arguments: argparse.Namespace) -> int:
     """`echelon run`"""
     if arguments.engine == "processes":
-        from sim.supervisor import warm_up
+        from sim.children import warm_up
 
         warm_up()
     scenario, plan = scenario_of(arguments)
@@ -71,17 +71,26 @@ def run(arguments: argparse.Namespace) -> int:
             display=display,
             stall_timeout_s=arguments.stall_timeout,
         )
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    except OSError as error:
+        print(f"echelon: {error.filename or folder}: {error.strerror or error}", file=sys.stderr)
+        return 3
     finally:
         display.close()
+    failure = finished.failure
     if not arguments.no_report:
-        _report([folder], folder / "report.html")
+        try:
+            _report([folder], folder / "report.html")
+        except (UsageError, OSError) as error:  # of a run that broke off there may be nothing to report
+            failure = failure or f"no report: {error}"
     if arguments.json:
         print(json.dumps(finished.summary, indent=2, allow_nan=False))
     else:
         print(summary_text(finished.summary))
         print(f"  folder   {folder}")
-    if finished.failure:
-        print(f"echelon: {finished.failure}", file=sys.stderr)
+    if failure:
+        print(f"echelon: {failure}", file=sys.stderr)
         return 3
     return 0 if finished.summary["verdict"]["holds"] else 1
 
@@ -94,12 +103,16 @@ def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_url: s
 
 
 def _checked_bus(url: str) -> str:
-    from bridge.bus import resolve_url
+    from bridge.bus import interface_is_up, resolve_url
 
     try:
-        return resolve_url(url)
+        resolved = resolve_url(url)
     except ValueError as error:
         raise UsageError(f"--can {url}: {error}") from None
+    kind, _, name = resolved.partition(":")
+    if kind == "socketcan" and not interface_is_up(name):
+        raise UsageError(f"--can {url}: there is no network interface {name} that is up")
+    return resolved
 
 
 def validate(arguments: argparse.Namespace) -> int:

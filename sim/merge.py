@@ -1,18 +1,18 @@
 """Puts the messages of many sources into one order of time, whatever the order in which their batches come."""
 
+from collections.abc import Iterable
+
 from echelon.messages import Message
 
 
 class TimeOrder:
     """Messages by (time, source, channel), released once every source has gone past their time.
 
-    Each source sends in order of time, up to its `ends` [ns].  What is released is the same for the same messages,
-    however they came.
+    Each source sends in order of time.  What is released is the same for the same messages, however they came.
     """
 
-    def __init__(self, ends: dict[int, int]) -> None:
-        self._ends = ends
-        self._latest = dict.fromkeys(ends, -1)
+    def __init__(self, sources: Iterable[int]) -> None:
+        self._latest = dict.fromkeys(sources, -1)
         self._waiting: dict[int, list[Message]] = {}
         self._released_ns = -1
         self.pushed = 0
@@ -36,18 +36,11 @@ class TimeOrder:
                 waiting[time_ns] = [message]
             else:
                 bucket.append(message)
-        # A source at its end sends nothing after it: it holds nobody up.
-        behind = [time_ns for source, time_ns in latest.items() if time_ns < self._ends[source]]
-        return self._release(min(behind) if behind else max(latest.values()))
+        return self._release(min(latest.values()))
 
     def rest(self) -> list[Message]:
-        """Returns what is left, in order: for the end of a run."""
+        """Returns what is left, in order: for the end of a run, when no source goes past the last instant."""
         return self._release(1 << 63)
-
-    @property
-    def complete(self) -> bool:
-        """True if every source has sent its last message."""
-        return all(latest >= self._ends[source] for source, latest in self._latest.items())
 
     def _release(self, safe_ns: int) -> list[Message]:
         """Releases everything before `safe_ns`."""

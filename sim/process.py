@@ -68,6 +68,10 @@ class Result:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
+class StartError(Exception):
+    """What this process needs cannot be had; the text is for the user."""
+
+
 def make_role(plan: Plan, index: int) -> Role:
     """Returns the role of one member: a robot, or a node of the tree."""
     return Robot(plan, index) if index < len(plan.robots) else TreeNode(plan, index)
@@ -89,20 +93,32 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
             from sim.watchers import run_bridge as body
         else:
             body = _run_member
-        with Session(listen=spec.listen, connect=spec.connect, lockstep=spec.virtual) as session:
+        with _open(spec) as session:
             body(spec, session, control)
     except SystemExit:
         os._exit(0)
+    except StartError as error:
+        control.send(("failed", str(error)))
+        os._exit(1)
     except BaseException:
         traceback.print_exc()
         sys.stderr.flush()
         os._exit(1)  # no atexit of the parent's, no wait for threads that may hang
 
 
+def _open(spec: ProcessSpec) -> Session:
+    try:
+        return Session(
+            listen=spec.listen, connect=spec.connect, lockstep=spec.virtual, own_sender=spec.kind == "bridge"
+        )
+    except ValueError as error:
+        raise StartError(str(error)) from None
+
+
 def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
     """Shows that this process is ready, waits for its peers and for the start; returns the start instant [ns].
 
-    To be called when all subscribers are declared: the token stands for them.  Raises TimeoutError naming who is
+    To be called when all subscribers are declared: the token stands for them.  Raises StartError naming who is
     missing, and who speaks another schema version.
     """
     tokens = session.watch_tokens(f"echelon/{spec.run}/@alive/**")
@@ -112,7 +128,7 @@ def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
     if missing:
         others = {key.split("/")[3] for key in tokens.alive()} - {str(SCHEMA_VERSION)}
         note = f"; some here speak schema version {', '.join(sorted(others))}, not {SCHEMA_VERSION}" if others else ""
-        raise TimeoutError(f"not there after {READY_TIMEOUT_S:g} s: {', '.join(wanted[key] for key in missing)}{note}")
+        raise StartError(f"not there after {READY_TIMEOUT_S:g} s: {', '.join(wanted[key] for key in missing)}{note}")
     control.send(("ready",))
     _, start_ns = control.recv()
     return int(start_ns)
@@ -135,6 +151,7 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
         virtual=spec.virtual,
     )
     start_ns = meet(spec, session, control)
+    signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())
     gc.collect()
     gc.disable()  # nothing in the loop makes cycles, and a pause of one role is a pause of all
     try:
@@ -143,14 +160,15 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
         else:
             runner.wall_clock(start_ns)
     finally:
-        runner.flush()  # what a run that breaks off has said so far is to be recorded
+        runner.finish()  # what a run that breaks off has said so far is to be recorded
+    signal.signal(signal.SIGTERM, _leave)
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, runner.counts, tuple(runner.mailbox.counts()))))
     control.recv()  # until everyone is done: a link that closes early would look like a death to its neighbours
 
 
 def _leave(number: int, frame: object) -> None:
-    """Ends this process in good order: what it holds back is sent, what it sent is delivered."""
+    """Ends this process in good order: what it sent is delivered."""
     raise SystemExit(0)
 
 

@@ -8,6 +8,7 @@ import resource
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +22,12 @@ from sim.merge import TimeOrder
 from sim.summary import summarise, write
 from sim.supervisor import Outcome, Progress, Supervisor
 from sim.trace import Trace
-from sim.watchers import Recording, ends
+from sim.watchers import Recording
 
 PARTS: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
+FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html")
+"""What a run leaves, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +41,8 @@ class Finished:
 
 
 def new_folder(scenario: Scenario, out: Path | None) -> Path:
-    """Makes the folder of a run: `out`, or `runs/<scenario>-<utc time>`.  Raises OSError."""
+    """Makes the folder of a run: `out`, or `runs/<scenario>-<utc time>`; what an earlier run left there goes, so that no
+    file of it is taken for this run's.  Raises OSError."""
     if out is None:
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         out = Path("runs") / f"{scenario.name}-{stamp}"
@@ -47,6 +51,8 @@ def new_folder(scenario: Scenario, out: Path | None) -> Path:
             out = Path("runs") / f"{scenario.name}-{stamp}-{count}"
             count += 1
     out.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)
     return out
 
 
@@ -61,7 +67,8 @@ def execute(
     display: Display,
     stall_timeout_s: float = 30.0,
 ) -> Finished:
-    """Runs a plan and writes the run's folder, except for the report (`write_run_report`)."""
+    """Runs a plan and writes the run's folder, except for the report.  Raises OSError if a file cannot be written, and
+    ValueError too if, in one process, the bus cannot be had."""
     toml = effective_toml(scenario)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
     metadata = {
@@ -77,7 +84,7 @@ def execute(
         outcome = Supervisor(
             plan,
             folder,
-            run=f"{folder.name}-{time.time_ns():x}",
+            run=blake2b(f"{folder.resolve()} {time.time_ns()}".encode(), digest_size=8).hexdigest(),
             virtual=clock == "virtual",
             can_url=can_url,
             scenario_toml=toml,
@@ -111,10 +118,7 @@ def _in_process(
         from bridge.station import Station
 
         station = Station(plan, can_url, folder)
-    sources = ends(plan)
-    if station is not None:
-        sources[len(plan.members)] = sources[0]
-    order = TimeOrder(sources)
+    order = TimeOrder(range(len(plan.members) + (station is not None)))
     gathered: list[Any] = []
     engine = Engine(plan, gathered.append)
     progress = Progress(phase="running", started_s=time.monotonic())

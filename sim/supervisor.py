@@ -5,25 +5,20 @@ outlives the supervisor: every process sees its pipe to it hang up, and ends, ev
 They talk over the loopback, at an address and ports of this run's own.
 """
 
-import os
 import signal
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from typing import Any, Final
 
 from echelon.link import LinkCounts
-from echelon.plan import Plan, RobotPlan
-from echelon.session import loopback_endpoints
-from sim.process import ProcessSpec, Result, main
+from echelon.plan import Plan
+from sim.children import WATCHERS, Child, list_specs, start
+from sim.process import ProcessSpec, Result
 from sim.trace import Trace, TraceBuilder
 
-PRELOAD: Final = ["sim.process"]
 START_TIMEOUT_S: Final = 30.0
 STALL_REPORT_S: Final = 3.0
 """A run in virtual time that stands still for so long is reported, with the process everyone waits for."""
@@ -31,8 +26,6 @@ GRACE_S: Final = 3.0
 """How long watchers may take to close their files when a run breaks off, and processes to end."""
 WALL_START_S: Final = 0.1
 """From the barrier to run time 0 on a wall clock."""
-LAST_WORDS: Final = 4000
-"""Bytes kept of what a process says on standard error."""
 
 
 @dataclass(slots=True)
@@ -64,39 +57,8 @@ class Outcome:
     failure: str | None = None
 
 
-@dataclass(slots=True)
-class _Child:
-    spec: ProcessSpec
-    process: ForkServerProcess
-    control: Connection
-    words: Connection
-    ready: bool = False
-    result: Result | None = None
-    waiting_for: list[int] = field(default_factory=list)
-    waiting_ns: int = -1
-    heard_s: float = 0.0
-    said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
-
-    @property
-    def name(self) -> str:
-        return self.spec.name
-
-    def last_words(self) -> str:
-        """Returns the end of what it said on standard error."""
-        return b"".join(self.said)[-LAST_WORDS:].decode(errors="replace").strip()
-
-
 class RunError(Exception):
     """The run cannot go on; the text says why."""
-
-
-def warm_up() -> None:
-    """Starts the fork server, which imports in the background what processes need.  Call it early."""
-    context = get_context("forkserver")
-    context.set_forkserver_preload(PRELOAD)
-    from multiprocessing.forkserver import ensure_running
-
-    ensure_running()
 
 
 class Supervisor:
@@ -121,8 +83,8 @@ class Supervisor:
         self.progress = Progress()
         self._show = show
         self._stall_timeout_s = stall_timeout_s
-        self._specs = order(_specs(plan, run, virtual, folder, can_url, scenario_toml, metadata or {}, recorded))
-        self._children: list[_Child] = []
+        self._specs = order(list_specs(plan, run, virtual, folder, can_url, scenario_toml, metadata or {}, recorded))
+        self._children: list[Child] = []
         self._moved_s = 0.0
         self._moved_at = (-1, -1)
         self._warned = False
@@ -134,14 +96,15 @@ class Supervisor:
         startup_s = wall_s = 0.0
         previous = signal.signal(signal.SIGTERM, _interrupt)
         try:
-            self._start()
+            for spec in self._specs:
+                self._children.append(start(spec))
             self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
             startup_s = time.monotonic() - begun_s
             start_s = time.monotonic() + (0.0 if self.virtual else WALL_START_S)
             self._tell_all(("start", round(start_s * 1e9)))
             self.progress.phase, self.progress.started_s = "running", start_s
             self._moved_s = time.monotonic()
-            members = [child for child in self._children if child.spec.kind not in ("recorder", "bridge")]
+            members = [child for child in self._children if child.is_member]
             limit_s = None if self.virtual else self.plan.duration_ns / 1e9 + 10.0
             self._until(lambda: all(child.result for child in members), limit_s, "not done")
             wall_s = time.monotonic() - start_s
@@ -164,19 +127,6 @@ class Supervisor:
             signal.signal(signal.SIGTERM, previous)
         return self._outcome(failure, startup_s, wall_s)
 
-    def _start(self) -> None:
-        context: ForkServerContext = get_context("forkserver")
-        context.set_forkserver_preload(PRELOAD)
-        for spec in self._specs:
-            control, child_control = context.Pipe()
-            words, child_words = context.Pipe(duplex=False)
-            process = context.Process(target=main, args=(spec, child_control, child_words), name=spec.name, daemon=True)
-            process.start()
-            child_control.close()
-            child_words.close()
-            os.set_blocking(words.fileno(), False)
-            self._children.append(_Child(spec, process, control, words, heard_s=time.monotonic()))
-
     def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
         """Serves the children until `done`.  Raises RunError if one is lost, the run stalls, or the time is up."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
@@ -197,7 +147,7 @@ class Supervisor:
 
     def _serve(self, timeout_s: float) -> None:
         """Takes what children say on their control pipes and on standard error."""
-        by_handle: dict[Any, _Child] = {}
+        by_handle: dict[Any, Child] = {}
         for child in self._children:
             if not child.control.closed:
                 by_handle[child.control] = child
@@ -208,21 +158,11 @@ class Supervisor:
             if isinstance(handle, Connection):
                 child = by_handle[handle]
                 if handle is child.words:
-                    self._hear_words(child)
+                    child.hear_words()
                 else:
                     self._hear(child)
 
-    def _hear_words(self, child: _Child) -> None:
-        try:
-            data = os.read(child.words.fileno(), 65536)
-        except BlockingIOError:
-            return
-        if data:
-            child.said.append(data)
-        else:
-            child.words.close()
-
-    def _hear(self, child: _Child) -> None:
+    def _hear(self, child: Child) -> None:
         try:
             kind, *rest = child.control.recv()
         except (EOFError, OSError):
@@ -245,6 +185,8 @@ class Supervisor:
                     raise RunError(f"the recording failed: {news['failure']}")
             case "progress":
                 progress.can.update(rest[0])
+            case "failed":
+                raise RunError(f"{child.spec.kind} {child.name} cannot start: {rest[0]}")
             case "done":
                 child.result = rest[0]
 
@@ -254,13 +196,10 @@ class Supervisor:
                 while not child.control.closed and child.control.poll():
                     self._hear(child)
                 if child.result is None:
-                    while not child.words.closed and wait([child.words], 0):
-                        before = len(child.said)
-                        self._hear_words(child)
-                        if len(child.said) == before:
-                            break
+                    if not child.words.closed:
+                        child.hear_words()
                     raise RunError(
-                        f"lost {child.spec.kind} {child.name} ({_ending(child.process)}){self._words_of([child.name])}"
+                        f"lost {child.spec.kind} {child.name} ({child.ending()}){self._words_of([child.name])}"
                     )
 
     def _words_of(self, names: list[str]) -> str:
@@ -292,18 +231,16 @@ class Supervisor:
 
     def _who_is_waited_for(self, now_s: float) -> str:
         """Says which processes everyone waits for: those that themselves wait for nobody and say nothing."""
-        silent = [
-            child for child in self._children if child.spec.kind in ("recorder", "bridge") and now_s - child.heard_s > 2
-        ]
+        silent = [child for child in self._children if not child.is_member and now_s - child.heard_s > 2]
         if not silent:
             silent = [
                 child
                 for child in self._children
-                if child.spec.kind not in ("recorder", "bridge") and child.result is None and now_s - child.heard_s > 2
+                if child.is_member and child.result is None and now_s - child.heard_s > 2
             ]
         if silent:
             return "everyone waits for " + ", ".join(
-                f"{child.name} (process {child.process.pid}, {_process_state(child.process.pid)})" for child in silent
+                f"{child.name} (process {child.process.pid}, {child.state()})" for child in silent
             )
         members = self.plan.members
         waits = [
@@ -315,7 +252,7 @@ class Supervisor:
 
     def _stop_members(self) -> None:
         """Ends the members of a run that broke off: first asked, so that what they hold back is sent, then made to."""
-        members = [child for child in self._children if child.spec.kind not in ("recorder", "bridge")]
+        members = [child for child in self._children if child.is_member]
         for child in members:
             if child.process.is_alive():
                 child.process.terminate()
@@ -332,7 +269,7 @@ class Supervisor:
         for child in self._children:
             if child.result and child.result.runner:
                 sent[child.spec.kind] += child.result.runner.messages
-        for kind in ("bridge", "recorder"):
+        for kind in WATCHERS:
             for child in self._children:
                 if child.spec.kind != kind or not child.ready or child.control.closed or not child.process.is_alive():
                     continue
@@ -352,7 +289,7 @@ class Supervisor:
                 if child.result is not None and kind == "bridge":
                     sent["bridge"] = child.result.extra["messages"]
                 if child.result is None:
-                    failure = failure or f"lost {kind} ({_ending(child.process)}){self._words_of([child.name])}"
+                    failure = failure or f"lost {kind} ({child.ending()}){self._words_of([child.name])}"
         for child in self._children:
             if child.spec.kind == "recorder" and child.result and child.result.extra["failure"]:
                 failure = failure or f"the recording failed: {child.result.extra['failure']}"
@@ -398,85 +335,11 @@ class Supervisor:
 
     def _tell_all(self, message: tuple[Any, ...]) -> None:
         for child in self._children:
-            child.control.send(message)
-
-
-def _specs(
-    plan: Plan,
-    run: str,
-    virtual: bool,
-    folder: Path,
-    can_url: str,
-    scenario_toml: str,
-    metadata: dict[str, str],
-    recorded: bool,
-) -> list[ProcessSpec]:
-    """Lists the processes of a run: every node listens, its children connect; all members connect to the watchers."""
-    watchers = ([("recorder", "recorder")] if recorded else []) + ([("bridge", "bridge")] if can_url else [])
-    endpoints = loopback_endpoints(len(plan.nodes) + len(watchers))
-    endpoint = {node.index: endpoints.pop() for node in plan.nodes}
-    watcher_endpoint = {name: endpoints.pop() for _, name in watchers}
-    specs = []
-    for member in plan.members:
-        peers = [] if member.parent is None else [member.parent]
-        peers += [] if isinstance(member, RobotPlan) else member.children
-        specs.append(
-            ProcessSpec(
-                run=run,
-                kind=member.role,
-                name=member.name,
-                index=member.index,
-                plan=plan,
-                virtual=virtual,
-                listen=(endpoint[member.index],) if member.index in endpoint else (),
-                connect=(
-                    *(() if member.parent is None else (endpoint[member.parent],)),
-                    *watcher_endpoint.values(),
-                ),
-                peers=(*((plan.members[peer].role, plan.members[peer].name) for peer in peers), *watchers),
-                watched=bool(watchers),
-            )
-        )
-    everyone = tuple((member.role, member.name) for member in plan.members)
-    for watcher, name in watchers:
-        others = tuple(endpoint for other, endpoint in watcher_endpoint.items() if other != name)
-        specs.append(
-            ProcessSpec(
-                run=run,
-                kind=watcher,
-                name=name,
-                index=len(plan.members),
-                plan=plan,
-                virtual=virtual,
-                listen=(watcher_endpoint[name],),
-                connect=others if watcher == "bridge" else (),
-                peers=(*everyone, *(one for one in watchers if one[1] != name)),
-                folder=str(folder),
-                can_url=can_url,
-                scenario_toml=scenario_toml,
-                metadata=metadata,
-            )
-        )
-    # Those that import most start first.
-    return sorted(specs, key=lambda spec: spec.kind not in ("recorder", "bridge"))
+            try:
+                child.control.send(message)
+            except OSError:
+                pass  # lost; `_check_lost` will say so
 
 
 def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt
-
-
-def _ending(process: ForkServerProcess) -> str:
-    code = process.exitcode
-    if code is None:
-        return "does not answer"
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-
-
-def _process_state(pid: int | None) -> str:
-    """Returns what the kernel says of a process: running, sleeping, stopped…"""
-    try:
-        text = Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return "gone"
-    state = next((line for line in text.splitlines() if line.startswith("State:")), "State: ? (unknown)")
-    return state.partition("(")[2].rstrip(")")

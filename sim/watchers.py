@@ -5,7 +5,7 @@ slow slows the run; on a wall clock it loses, and says so.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from echelon.plan import Plan
 from echelon.session import Inbox, Session
 from echelon.wire import WireError, decode, encode, join, split, watch_key
 from sim.merge import TimeOrder
-from sim.process import ProcessSpec, Result, meet, resources
+from sim.process import ProcessSpec, Result, StartError, meet, resources
 from sim.recorder import Recorder
 from sim.trace import TraceBuilder
 
@@ -33,7 +33,7 @@ SILENCE_S: Final = 0.3
 class Reception:
     """Batches from the session, in one order of time."""
 
-    def __init__(self, inbox: Inbox, sources: dict[int, int]) -> None:
+    def __init__(self, inbox: Inbox, sources: Iterable[int]) -> None:
         self._inbox = inbox
         self._order = TimeOrder(sources)
         self.refused: dict[str, int] = {}
@@ -70,29 +70,15 @@ class Reception:
         return sum(self.refused.values()) + self._order.refused
 
 
-def ends(plan: Plan) -> dict[int, int]:
-    """Returns by member the time [ns] of the last message it will send in a whole run."""
-    by_index = {node.index: node for node in plan.nodes}
-    return {
-        member.index: plan.duration_ns
-        - plan.duration_ns
-        % (
-            member.period_ns
-            if member.parent is None or not isinstance(member, type(plan.root))
-            else min(member.period_ns, by_index[member.parent].period_ns)
-        )
-        for member in plan.members
-    }
-
-
 def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
     plan = spec.plan
-    sources = ends(plan)
-    if spec.can_url:
-        sources[len(plan.members)] = plan.duration_ns - plan.duration_ns % plan.robots[0].period_ns
+    sources = range(len(plan.members) + bool(spec.can_url))  # the bridge's messages come after the members'
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources)
-    recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
+    try:
+        recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
+    except OSError as error:
+        raise StartError(f"{error.filename}: {error.strerror}") from None
     meet(spec, session, control)
     said_s = time.monotonic()
     while True:
@@ -163,13 +149,13 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
     from bridge.station import Station  # python-can and cantools, for this process alone
 
     plan = spec.plan
-    all_ends = ends(plan)
-    reception = Reception(
-        session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER),
-        {robot.index: all_ends[robot.index] for robot in plan.robots},
-    )
+    robots = [robot.index for robot in plan.robots]
+    reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots)
     publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
-    station = Station(plan, spec.can_url, Path(spec.folder))
+    try:
+        station = Station(plan, spec.can_url, Path(spec.folder))
+    except (ValueError, OSError) as error:
+        raise StartError(str(error)) from None
     control.send(("bus", station.url))
     meet(spec, session, control)
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -112,6 +113,8 @@ def test_plain_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
         (("run", "paper", "--set", "duratoin=3"), "did you mean 'duration'"),
         (("run", "paper", "--set", "duration"), "key=value"),
         (("run", "paper", "--can", "serial:1"), "serial"),
+        (("run", "paper", "--can", "socketcan:nope"), "no network interface nope that is up"),
+        (("run", "paper", "--out", "pyproject.toml"), "--out pyproject.toml: File exists"),
         (("run", "paper", "--out", "/proc/nowhere"), "--out /proc/nowhere"),
         (("report", "no-such-run"), "no-such-run"),
         (("export", "no-such-run", "--csv", "x"), "no-such-run"),
@@ -125,6 +128,44 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments: tuple[str, ...], says:
     assert says in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not done.stdout
+
+
+def test_a_folder_used_again_keeps_nothing_of_the_earlier_run(tmp_path: Path) -> None:
+    notes = tmp_path / "notes.txt"
+    for name in ("can.log", "report.html", "run.mcap", "notes.txt"):
+        (tmp_path / name).write_text("old")
+    done = echelon("run", "paper", *QUICK, "--engine", "inprocess", "--can", "none", "--no-report", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {file.name for file in tmp_path.iterdir()} == {"scenario.toml", "run.mcap", "summary.json", "notes.txt"}
+    assert notes.read_text() == "old"
+
+
+def test_a_folder_may_have_any_name_and_a_run_a_single_tick(tmp_path: Path) -> None:
+    folder = tmp_path / "a#b*?$c @"
+    options = ("--set", "duration=0.001", "--set", "claims=[]", "--can", "virtual", "--quiet", "--json")
+    done = echelon("run", "paper", *options, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    assert json.loads(done.stdout)["trace_digest"] == trace_of(plan_of("paper", "duration=0.001")).digest()
+    assert (folder / "report.html").exists()
+
+
+def test_no_room_for_the_first_file_is_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "echelon.cli", "run", "paper", *QUICK, "--can", "none", "--quiet", "--json"]
+    limited = f"ulimit -f 1; exec {shlex.join(command)} --out {shlex.quote(str(tmp_path))}"
+    done = subprocess.run(["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 3
+    assert done.stderr.splitlines() == [f"echelon: {tmp_path}: File too large"]
+    assert not done.stdout
+
+
+def test_a_bus_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
+    options = ("--can", "socketcan:lo", "--quiet", "--json", "--out", tmp_path)  # an interface, but none of CAN
+    done = echelon("run", "paper", *QUICK, *options)
+    assert done.returncode == 3
+    assert len(done.stderr.splitlines()) == 1
+    assert "bridge cannot start: cannot open CAN bus socketcan:lo" in done.stderr
+    assert not json.loads(done.stdout)["verdict"]["holds"]
 
 
 def test_recover_refuses_what_is_no_recording(tmp_path: Path) -> None:

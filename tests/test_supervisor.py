@@ -18,6 +18,7 @@ from sim.recording import read_trace, recover
 from sim.supervisor import Outcome, Progress, Supervisor
 
 LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
+LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0},{channel="reference",loss=1.0}]'
 SHORT = "duration=0.3"
 
 
@@ -53,7 +54,7 @@ def finished(command: Popen[str]) -> tuple[int, str, str]:
     return command.returncode, out, err
 
 
-@pytest.mark.parametrize("links", [(), (LINKS,)], ids=["ideal", "delay and loss"])
+@pytest.mark.parametrize("links", [(), (LINKS,), (LATE, "duration=2")], ids=["ideal", "delay and loss", "very late"])
 def test_processes_give_the_trace_of_one_process(tmp_path: Path, links: tuple[str, ...]) -> None:
     plan = plan_of("paper", SHORT, *links)
     expected = trace_of(plan).digest()
@@ -166,6 +167,41 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
     assert outcome.failure is not None
     assert outcome.failure.startswith("stalled")
     assert not Path(f"/proc/{stopped[0]}").exists()
+
+
+@pytest.mark.parametrize("name", ["recorder", "bridge", "g1"])
+def test_a_process_that_stands_still_for_a_while_costs_only_time(tmp_path: Path, name: str) -> None:
+    plan, notes = plan_of("paper", "duration=3", LINKS), []
+    stopped: list[int] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns and not stopped:
+            stopped.append(pid_of(os.getsid(0), name))
+            os.kill(stopped[0], signal.SIGSTOP)
+        if progress.note and progress.note not in notes:
+            notes.append(progress.note)
+            if f"everyone waits for {name}" in progress.note:
+                os.kill(stopped[0], signal.SIGCONT)
+
+    outcome = supervised(plan, tmp_path, show=watch, can_url="virtual")
+    assert outcome.failure is None, notes
+    assert f"everyone waits for {name}" in notes[0]
+    assert outcome.trace.digest() == trace_of(plan).digest()
+    assert outcome.can["frames"] == 9 * 3000
+
+
+def test_ctrl_c_during_start_up_ends_without_a_traceback(tmp_path: Path) -> None:
+    options = ("--set", "duration=1000", "--can", "none", "--quiet", "--no-report", "--out", tmp_path / "run")
+    command = start_echelon("run", "paper", *options)
+    try:
+        assert until(lambda: len(session_members(command.pid)) > 2)  # the fork server is just importing
+        os.killpg(command.pid, signal.SIGINT)
+        code, out, err = finished(command)
+    finally:
+        kill_session(command.pid)
+    assert code in (3, -signal.SIGINT)  # the latter if an import was interrupted: Python tells its caller so
+    assert err.splitlines()[-1] == "echelon: interrupted"
+    assert "Traceback" not in out + err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -14,7 +14,8 @@ from typing import Final
 
 from echelon.plan import Plan, RobotPlan
 from echelon.session import loopback_endpoints
-from sim.process import ProcessSpec, Result, main
+from sim.joining import ProcessSpec, Result
+from sim.process import main
 
 PRELOAD: Final = ["sim.process"]
 LAST_WORDS: Final = 4000

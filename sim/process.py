@@ -7,69 +7,25 @@ when it is told to, and says `done` with what it counted.  Its words on standard
 import ctypes
 import gc
 import os
-import resource
 import select
 import signal
 import sys
 import threading
-import time
 import traceback
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from agents.robot import Robot
 from controller.node import TreeNode
-from echelon.link import LinkCounts
 from echelon.plan import Plan
 from echelon.role import Role
-from echelon.runner import Runner, RunnerCounts
+from echelon.runner import Runner
 from echelon.session import Session
-from echelon.wire import SCHEMA_VERSION, token_key
+from sim.joining import ProcessSpec, Result, StartError, meet, resources
 
-READY_TIMEOUT_S: Final = 20.0
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
 _libc: Final = ctypes.CDLL(None, use_errno=True)
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessSpec:
-    """Everything a process of a run needs to know."""
-
-    run: str
-    kind: str
-    """`robot`, `leader`, `coordinator`, `recorder` or `bridge`"""
-    name: str
-    index: int
-    plan: Plan
-    virtual: bool
-    listen: tuple[str, ...]
-    connect: tuple[str, ...]
-    peers: tuple[tuple[str, str], ...]
-    """(kind, name) of the processes whose tokens it waits for"""
-    watched: bool = True
-    folder: str = ""
-    can_url: str = ""
-    scenario_toml: str = ""
-    metadata: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """What a process leaves behind."""
-
-    name: str
-    cpu_s: float
-    resident_bytes: int
-    runner: RunnerCounts | None = None
-    links: tuple[LinkCounts, ...] = ()
-    extra: dict[str, Any] = field(default_factory=dict)
-
-
-class StartError(Exception):
-    """What this process needs cannot be had; the text is for the user."""
 
 
 def make_role(plan: Plan, index: int) -> Role:
@@ -113,32 +69,6 @@ def _open(spec: ProcessSpec) -> Session:
         )
     except ValueError as error:
         raise StartError(str(error)) from None
-
-
-def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
-    """Shows that this process is ready, waits for its peers and for the start; returns the start instant [ns].
-
-    To be called when all subscribers are declared: the token stands for them.  Raises StartError naming who is
-    missing, and who speaks another schema version.
-    """
-    tokens = session.watch_tokens(f"echelon/{spec.run}/@alive/**")
-    session.declare_token(token_key(spec.run, spec.kind, spec.name, f"{os.getpid()}-{time.monotonic_ns()}"))
-    wanted = {token_key(spec.run, kind, name, "*"): name for kind, name in spec.peers}
-    missing = tokens.wait(wanted, READY_TIMEOUT_S)
-    if missing:
-        others = {key.split("/")[3] for key in tokens.alive()} - {str(SCHEMA_VERSION)}
-        note = f"; some here speak schema version {', '.join(sorted(others))}, not {SCHEMA_VERSION}" if others else ""
-        raise StartError(f"not there after {READY_TIMEOUT_S:g} s: {', '.join(wanted[key] for key in missing)}{note}")
-    control.send(("ready",))
-    _, start_ns = control.recv()
-    return int(start_ns)
-
-
-def resources() -> tuple[float, int]:
-    """Returns the CPU time [s] and the resident memory [bytes] of this process so far."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return usage.ru_utime + usage.ru_stime, pages * resource.getpagesize()
 
 
 def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Final
 from echelon.link import LinkCounts
 from echelon.plan import Plan
 from sim.children import WATCHERS, Child, list_specs, start
-from sim.process import ProcessSpec, Result
+from sim.joining import ProcessSpec, Result
 from sim.trace import Trace, TraceBuilder
 
 START_TIMEOUT_S: Final = 30.0
@@ -24,6 +24,8 @@ STALL_REPORT_S: Final = 3.0
 """A run in virtual time that stands still for so long is reported, with the process everyone waits for."""
 GRACE_S: Final = 3.0
 """How long watchers may take to close their files when a run breaks off, and processes to end."""
+FINISH_TIMEOUT_S: Final = 60.0
+"""How long watchers may take when a run is done."""
 WALL_START_S: Final = 0.1
 """From the barrier to run time 0 on a wall clock."""
 
@@ -281,9 +283,13 @@ class Supervisor:
                 }
                 try:
                     child.control.send(("finish", order))
-                    deadline_s = time.monotonic() + (GRACE_S if failure else 60.0)
-                    while child.result is None and child.process.is_alive() and time.monotonic() < deadline_s:
+                    begun_s = time.monotonic()
+                    patience_s = GRACE_S if failure else FINISH_TIMEOUT_S
+                    while child.result is None and child.process.is_alive() and time.monotonic() - begun_s < patience_s:
                         self._serve(0.05)
+                        if not failure and time.monotonic() - begun_s > STALL_REPORT_S:
+                            self.progress.note = f"waits for {child.name} to finish ({child.state()})"
+                            self._show(self.progress)
                 except (RunError, OSError) as error:
                     failure = failure or str(error)
                 if child.result is not None and kind == "bridge":

@@ -16,8 +16,8 @@ from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.session import Inbox, Session
 from echelon.wire import WireError, decode, encode, join, split, watch_key
+from sim.joining import ProcessSpec, Result, StartError, meet, resources
 from sim.merge import TimeOrder
-from sim.process import ProcessSpec, Result, StartError, meet, resources
 from sim.recorder import Recorder
 from sim.trace import TraceBuilder
 

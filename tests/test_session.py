@@ -251,6 +251,42 @@ def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> N
     assert numbers == list(range(1000))
 
 
+def _relay(endpoint: str, parent: Connection) -> None:
+    with Session(listen=[endpoint], connect=[], lockstep=True, own_sender=True) as session:
+        inbox = session.inbox("run/state", 8)
+        assert awaited(session, "run/@alive/end") == set()
+        publisher = session.publisher("run/relayed")
+        session.declare_token("run/@alive/receiver")
+        for _ in range(1000):
+            for payload in inbox.take(TIMEOUT_S):
+                publisher.put(payload)
+        parent.recv()
+
+
+def test_a_relay_held_up_on_both_sides_goes_on(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    child(stack, _relay, endpoint)
+    session = stack.enter_context(Session(listen=[], connect=[endpoint], lockstep=True))
+    inbox = session.inbox("run/relayed", 8)
+    session.declare_token("run/@alive/end")
+    _, flood = child(stack, _flood, endpoint)
+    begun = -1
+    while flood.poll(
+        0.5 if begun > 100 else TIMEOUT_S
+    ):  # until all stand still: the relay in a put, and its inbox full
+        found = flood.recv()
+        assert found is not None, "nothing held the sender back"
+        begun = found
+    numbers: list[int] = []
+    while len(numbers) < 1000:
+        while flood.poll():
+            flood.recv()
+        payloads = inbox.take(TIMEOUT_S)
+        assert payloads, "the relay sends nothing more"
+        numbers += [int.from_bytes(payload[:4], "little") for payload in payloads]
+    assert numbers == list(range(1000))
+
+
 def test_on_the_wall_clock_the_newest_are_kept(stack: ExitStack) -> None:
     session = stack.enter_context(Session(listen=[], connect=[], lockstep=False))
     inbox: Inbox = session.inbox("run/state", 4)

@@ -13,7 +13,7 @@ import pytest
 from runs import kill_session, plan_of, session_members, start_echelon, summary_of, trace_of, until
 
 from echelon.plan import Plan
-from sim.process import ProcessSpec
+from sim.joining import ProcessSpec
 from sim.recording import read_trace, recover
 from sim.supervisor import Outcome, Progress, Supervisor
 
@@ -170,7 +170,10 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", ["recorder", "bridge", "g1"])
-def test_a_process_that_stands_still_for_a_while_costs_only_time(tmp_path: Path, name: str) -> None:
+def test_a_process_that_stands_still_for_a_while_costs_only_time(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sim.supervisor.STALL_REPORT_S", 1.0)
     plan, notes = plan_of("paper", "duration=3", LINKS), []
     stopped: list[int] = []
 
@@ -180,12 +183,12 @@ def test_a_process_that_stands_still_for_a_while_costs_only_time(tmp_path: Path,
             os.kill(stopped[0], signal.SIGSTOP)
         if progress.note and progress.note not in notes:
             notes.append(progress.note)
-            if f"everyone waits for {name}" in progress.note:
+            if f"for {name}" in progress.note and "stopped" in progress.note:
                 os.kill(stopped[0], signal.SIGCONT)
 
     outcome = supervised(plan, tmp_path, show=watch, can_url="virtual")
     assert outcome.failure is None, notes
-    assert f"everyone waits for {name}" in notes[0]
+    assert f"for {name}" in notes[0]
     assert outcome.trace.digest() == trace_of(plan).digest()
     assert outcome.can["frames"] == 9 * 3000
 

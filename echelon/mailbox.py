@@ -14,7 +14,7 @@ from echelon.messages import Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Role
 
-LEAD: Final = 256
+LEAD: Final = 32
 """Periods by which a role in a lockstep may be ahead of any of its sources.  A link that is late or loses would let it run
 on without them, and what it sends would pile up in front of them."""
 SLACK: Final = 4 * LEAD

@@ -6,7 +6,7 @@ may wait for others, sending batches to those who watch, and for long stretches 
 
 Zenoh's thread also does the sending, so it must never wait: not for the main thread (what comes while that one moves the
 role is put aside for it), and not for room to put a message (`mailbox.LEAD` bounds what may be on the way to a receiver
-that reads nothing, and the session has room for that).
+that reads nothing; a session has room for 128 KiB).
 
 On a wall clock the main thread waits for each stage's inputs until the stage's deadline, counts what was late, and goes on
 with the newest it has.

@@ -133,16 +133,15 @@ class Session:
     """
 
     def __init__(
-        self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool, own_sender: bool = False
+        self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool, own_receiver: bool = False
     ) -> None:
-        """`own_sender` is for a process that holds an inbox in lockstep and puts, too: sending must go on while receiving
-        stands still.  It holds for the process, and only before its first session."""
+        """`own_receiver` is for a process that puts besides holding an inbox in lockstep: it gives receiving a thread of its
+        own, so that sending goes on while receiving stands still.  It counts in a process's first session only."""
         if lockstep:
             _prefer_throughput()
-        if own_sender:
-            os.environ["ZENOH_RUNTIME"] = os.environ["ZENOH_RUNTIME"].replace(
-                "tx:(handover:app)", "tx:(worker_threads:1)"
-            )
+        if own_receiver:
+            runtime = os.environ["ZENOH_RUNTIME"]
+            os.environ["ZENOH_RUNTIME"] = runtime.replace("rx:(handover:app)", "rx:(worker_threads:1)")
         self._lockstep = lockstep
         self._session = _open(listen, connect, lockstep)
         self._kept: list[object] = []  # what is declared lives as long as the session
@@ -242,11 +241,6 @@ def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zeno
     if lockstep:
         # Whoever is stopped is waited for, with all that was put for it; the run's supervisor decides when to give up.
         settings["transport/link/tx/lease"] = LEASE_MS
-        # A put in Zenoh's thread must find room: who waits there keeps the room from being made.  So 1 MiB per link, all of
-        # it from the start, for a queue that grows as needed has been seen to stall.
-        for queue in ("control", "data"):
-            settings[f"transport/link/tx/queue/size/{queue}"] = 16
-        settings["transport/link/tx/queue/allocation/mode"] = "init"
         settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = LEASE_MS * 1000
     config = zenoh.Config()
     for name, value in settings.items():

@@ -65,7 +65,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
 def _open(spec: ProcessSpec) -> Session:
     try:
         return Session(
-            listen=spec.listen, connect=spec.connect, lockstep=spec.virtual, own_sender=spec.kind == "bridge"
+            listen=spec.listen, connect=spec.connect, lockstep=spec.virtual, own_receiver=spec.kind == "bridge"
         )
     except ValueError as error:
         raise StartError(str(error)) from None

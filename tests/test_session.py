@@ -252,7 +252,7 @@ def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> N
 
 
 def _relay(endpoint: str, parent: Connection) -> None:
-    with Session(listen=[endpoint], connect=[], lockstep=True, own_sender=True) as session:
+    with Session(listen=[endpoint], connect=[], lockstep=True, own_receiver=True) as session:
         inbox = session.inbox("run/state", 8)
         assert awaited(session, "run/@alive/end") == set()
         publisher = session.publisher("run/relayed")

@@ -173,7 +173,7 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
 def test_a_process_that_stands_still_for_a_while_costs_only_time(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sim.supervisor.STALL_REPORT_S", 1.0)
+    monkeypatch.setattr("sim.supervisor.STALL_REPORT_S", 2.2)
     plan, notes = plan_of("paper", "duration=3", LINKS), []
     stopped: list[int] = []
 
@@ -188,7 +188,7 @@ def test_a_process_that_stands_still_for_a_while_costs_only_time(
 
     outcome = supervised(plan, tmp_path, show=watch, can_url="virtual")
     assert outcome.failure is None, notes
-    assert f"for {name}" in notes[0]
+    assert any(f"for {name}" in note for note in notes)
     assert outcome.trace.digest() == trace_of(plan).digest()
     assert outcome.can["frames"] == 9 * 3000
 

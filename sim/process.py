@@ -15,22 +15,14 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Final
 
-from agents.robot import Robot
-from controller.node import TreeNode
-from echelon.plan import Plan
-from echelon.role import Role
 from echelon.runner import Runner
 from echelon.session import Session
+from sim.engine import make_role
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
 _libc: Final = ctypes.CDLL(None, use_errno=True)
-
-
-def make_role(plan: Plan, index: int) -> Role:
-    """Returns the role of one member: a robot, or a node of the tree."""
-    return Robot(plan, index) if index < len(plan.robots) else TreeNode(plan, index)
 
 
 def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:

@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import Any
 
 from bridge.bus_load import many_frame_bits
-from bridge.native import MAX_ROBOTS, NativeCodec, frame_id
+from bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
 
 _BLOCK = 1024
 

@@ -8,7 +8,7 @@ from cantools.database import Database
 from cantools.database.can import Message, Node, Signal
 from cantools.database.conversion import BaseConversion
 
-from bridge.native import BASE_ID, CLIPPED, ENABLE, LENGTH, MAX_ROBOTS, RAW_MAX, SATURATED, NativeCodec
+from bridge.native.codec import BASE_ID, CLIPPED, ENABLE, LENGTH, MAX_ROBOTS, RAW_MAX, SATURATED, NativeCodec
 
 _SENDER = "bridge"
 _LONGEST = 32 - len("torque_")  # a DBC identifier has at most 32 characters

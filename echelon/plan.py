@@ -42,6 +42,8 @@ class RobotPlan:
     wheel_speed_limit: float
     period_ns: int
     torque_period_ns: int
+    drive: "DrivePlan"
+    envelope: "EnvelopePlan"
 
     @property
     def name(self) -> str:
@@ -52,6 +54,81 @@ class RobotPlan:
     def role(self) -> str:
         """`robot`"""
         return "robot"
+
+
+@dataclass(frozen=True, slots=True)
+class MotorPlan:
+    """The motor of a wheel and its power stage, SI units, temperatures in °C."""
+
+    torque_limit: float
+    """Largest shaft torque [N m]"""
+    rated_torque: float
+    """Torque it can give for ever [N m]; what CiA 402 counts in thousandths of"""
+    torque_slew: float
+    """Largest change of the setpoint [N m/s]"""
+    lag: float
+    """Time constant of the current loop [s]; 0: the torque follows at once"""
+    torque_constant: float
+    """K_t [N m/A]"""
+    resistance: float
+    """Of the winding [Ω]: it is heated by resistance · current²"""
+    thermal_resistance: float
+    """Winding to ambient [K/W]"""
+    thermal_time: float
+    """Time constant of the winding's temperature [s]"""
+    ambient: float
+    derating_from: float
+    """The torque limit falls linearly to zero from here to `temperature_limit`"""
+    temperature_limit: float
+    """Over-temperature fault from here on"""
+    supply_voltage: float
+    supply_resistance: float
+    """Of battery and cables [Ω]: the bus voltage falls with the current that the motor draws"""
+    brown_out: float
+    """Under this bus voltage the drive gives up [V]"""
+    encoder_counts: int
+    """Per revolution of the wheel"""
+    inertia: float
+    """What the motor turns where no robot does [kg m²]: a wheel on a bench"""
+    friction: float
+    """The same wheel's friction [N m s/rad]"""
+
+
+@dataclass(frozen=True, slots=True)
+class DrivePlan:
+    """The drives of a robot's wheels: their protocol, their place on the bus, their motor (both wheels have the same)."""
+
+    protocol: str
+    """`native`, `odrive` or `cia402`"""
+    bus: int
+    """Which of the plan's buses"""
+    node_ids: tuple[int, int]
+    """Of the right and the left wheel's drive; the robot's number, twice, for `native`"""
+    period_ns: int
+    """Between two torque frames, and between two feedback frames"""
+    watchdog_ns: int
+    """A drive that hears no command for so long stops, and stays stopped"""
+    torque_scale: float
+    """Of the native frame [N m per bit]"""
+    recover_ns: int | None
+    """So long after a fault the host clears it and enables the drive anew; None: never"""
+    motor: MotorPlan
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopePlan:
+    """What the last gate before the bus lets pass, for each wheel."""
+
+    torque_limit: float
+    """[N m]"""
+    rise_limit: float
+    """Largest growth of a torque's magnitude from frame to frame [N m]"""
+    fall_limit: float
+    """Largest decrease of a torque's magnitude from frame to frame [N m]"""
+    window_limit: float
+    """Largest difference between two torques within 250 ms [N m]"""
+    stale_ns: int
+    """Oldest command that may still become a frame"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,7 +144,7 @@ def validate(arguments: argparse.Namespace) -> int:
 
 def _read_run(folder: Path) -> Any:
     """Reads a run's folder for a report.  Raises UsageError."""
-    from bridge.native import NativeCodec
+    from bridge.native.codec import NativeCodec
     from sim.recording import read_trace
     from sim.report import RunForReport
 
@@ -164,7 +164,7 @@ def _read_run(folder: Path) -> Any:
 def _first_frames(path: Path, plan: Plan, codec: Any, count: int = 18) -> tuple[dict[str, object], ...]:
     """Returns the first frames of a run's can.log, decoded; none if there is no log."""
     from bridge.canlog import read_frames
-    from bridge.native import Torque
+    from bridge.native.codec import Torque
 
     rows = []
     for time_ns, identifier, data in read_frames(path, count):

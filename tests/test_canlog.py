@@ -13,7 +13,7 @@ import pytest
 
 from bridge.canlog import FLUSH_NS, CanLog
 from bridge.dbc import torque_dbc
-from bridge.native import NativeCodec, frame_id
+from bridge.native.codec import NativeCodec, frame_id
 
 EPOCH = 1_700_000_000_000_000_000
 DATA = bytes.fromhex("e80324fa010700f3")

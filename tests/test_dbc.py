@@ -10,7 +10,7 @@ import pytest
 from cantools.database.can import Database
 
 from bridge.dbc import identifiers, torque_dbc
-from bridge.native import NativeCodec, frame_id
+from bridge.native.codec import NativeCodec, frame_id
 
 ROBOTS = ["g1/r1", "g1/r2", "g2/r1"]
 

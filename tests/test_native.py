@@ -8,7 +8,7 @@ from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.native import LENGTH, MAX_ROBOTS, RAW_MAX, CounterCheck, NativeCodec, Refusal, Torque, crc8, frame_id
+from bridge.native.codec import LENGTH, MAX_ROBOTS, RAW_MAX, CounterCheck, NativeCodec, Refusal, Torque, crc8, frame_id
 
 MILLI = NativeCodec(0.001)
 

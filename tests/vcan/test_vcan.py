@@ -14,7 +14,7 @@ import pytest
 from bridge.bridge import Bridge, Frame
 from bridge.bus import Bus, listen_command, open_bus, resolve_url
 from bridge.dbc import torque_dbc
-from bridge.native import NativeCodec, Torque
+from bridge.native.codec import NativeCodec, Torque
 
 pytestmark = pytest.mark.vcan
 

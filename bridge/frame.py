@@ -1,0 +1,90 @@
+"""What all drive protocols share: the frame, and what a virtual drive and its host are to those who run them.
+
+Both are plain objects: frames and the time in, frames out.  They never wait, read no clock and send nothing themselves.
+What comes from the bus is checked, counted in `refused`, and dropped; it never raises.
+"""
+
+from collections import Counter
+from typing import NamedTuple, Protocol
+
+from bridge.motor import Fault, Motor
+
+
+class Frame(NamedTuple):
+    """A classic CAN frame with an 11-bit identifier; a remote frame (RTR) has no data."""
+
+    can_id: int
+    data: bytes = b""
+    remote: bool = False
+
+
+class Drive(Protocol):
+    """A virtual drive: what answers on the bus, with the motor of one wheel or of both.
+
+    Time never runs backwards; before a frame is handed over, `advance` is called for its time.
+    """
+
+    motors: tuple[Motor, ...]
+    refused: Counter[str]
+    """Frames that were refused, by reason."""
+
+    @property
+    def identifiers(self) -> frozenset[int]:
+        """Identifiers of the frames it listens to."""
+
+    @property
+    def due_ns(self) -> int:
+        """When it next has something to do on its own."""
+
+    def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
+        """Takes a frame; returns what it answers at once."""
+
+    def advance(self, time_ns: int) -> list[Frame]:
+        """Lets time pass; returns what it sends on its own until then, what is due at `time_ns` included."""
+
+    def inject(self, time_ns: int, wheel: int, fault: Fault) -> list[Frame]:
+        """Makes a fault happen at one wheel (0 right, 1 left), on demand."""
+
+    def mend(self, time_ns: int, wheel: int, fault: Fault) -> None:
+        """Takes the cause of a fault away; what it latched stays latched until it is cleared over the bus."""
+
+
+class Host(Protocol):
+    """What commands a robot's drives: the bridge's side of a protocol, for both wheels of one robot.
+
+    A cycle is `poll`, then `command`, once per period, and `receive` for each frame that comes in between.
+    """
+
+    refused: Counter[str]
+    """Frames that were refused, by reason."""
+    torque: tuple[float, float]
+    """Torque of the right and left wheel as the drives last reported it [N m]; zeros before the first report."""
+    torque_ns: int | None
+    """When that report came; None before the first."""
+
+    @property
+    def identifiers(self) -> frozenset[int]:
+        """Identifiers of the frames it listens to."""
+
+    @property
+    def enabled(self) -> bool:
+        """True while both wheels take torque, as far as their drives said."""
+
+    @property
+    def fault(self) -> str:
+        """What a drive reports to be wrong, in words; empty if nothing is."""
+
+    def poll(self, time_ns: int) -> list[Frame]:
+        """Returns what is due besides torques: to bring drives up, keep them alive, or clear a fault and enable anew."""
+
+    def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
+        """Returns the frames for wheel torques [N m], finite ones; zeros are sent while a drive is not enabled."""
+
+    def stop(self, time_ns: int) -> list[Frame]:
+        """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
+
+    def start(self) -> None:
+        """Lets `poll` enable the drives (again).  A new host is started."""
+
+    def receive(self, time_ns: int, frame: Frame) -> None:
+        """Takes a frame from the bus."""

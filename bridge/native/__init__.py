@@ -1,0 +1,1 @@
+"""The native protocol: both wheels of a robot in one frame, with counter and CRC."""

@@ -1,7 +1,8 @@
 """The robot as a role: it says its state, hears one acceleration, and moves under its own torque loop until the next.
 
 The torque loop runs at its own period inside the robot.  What it did in a period travels with the state at its end:
-one message, where a separate one for torque would cost every delivery twice.
+one message, where a separate one for torque would cost every delivery twice.  Where the torque path is closed, the
+wheels are turned by drives on a bus instead, and wanted torques travel there in messages of their own.
 """
 
 from collections.abc import Sequence
@@ -37,7 +38,7 @@ class Robot:
         self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
         self._did = (0.0,) * 9
         deepest = max(node.depth for node in plan.nodes)
-        self.stages = (
+        self.stages: tuple[Stage, ...] = (
             Stage("say", 0, robot.period_ns, (), self._say),
             Stage("move", 2 * deepest + 3, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
         )
@@ -87,3 +88,86 @@ class Robot:
         self._did = (
             ax, ay, right_sum / n, left_sum / n, right_square / n, left_square / n, right_peak, left_peak, float(saturated),
         )  # fmt: skip
+
+
+class RobotOnBus(Robot):
+    """The same robot with its torque path closed: it says what torques it wants, and moves with those its drives report.
+
+    At an instant it first moves through the torque period that ends there, then says its state; when the acceleration
+    has come, it says its torques.
+    """
+
+    def __init__(self, plan: Plan, index: int) -> None:
+        super().__init__(plan, index)
+        robot = plan.robots[index]
+        self._torques: list[tuple[float, float]] = []
+        self._limited_count = 0
+        self._heard = (0.0, 0.0)
+        deepest = max(node.depth for node in plan.nodes)
+        bridge = plan.stations[0].index
+        h_ns = robot.torque_period_ns
+        self.stages = (
+            Stage("move", -1, h_ns, (Input(bridge, Channel.WHEELS),), self._turn),
+            Stage("say", 0, robot.period_ns, (), self._say),
+            Stage("want", 2 * deepest + 3, h_ns, (Input(robot.parent, Channel.COMMAND),), self._want),
+        )
+
+    def _turn(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Moves through the torque period that ends at `time_ns`."""
+        if time_ns == 0:
+            return ()
+        wheels = heard[0]
+        at = 2 * self.index
+        right, left = (0.0, 0.0) if wheels is None else wheels.values[at : at + 2].tolist()
+        self._torques.append((right, left))
+        try:
+            self.state = self._step(self.state, right, left, self._h)
+        except (ValueError, OverflowError):  # the run diverged
+            self.state = LOST
+        if time_ns % self._plan.period_ns == 0:
+            self._sum_up()
+        return ()
+
+    def _sum_up(self) -> None:
+        """Notes what the wheels did in the period that ends."""
+        right, left = zip(*self._torques, strict=True)
+        n = len(self._torques)
+        self._did = (
+            *self._heard,
+            sum(right) / n,
+            sum(left) / n,
+            sum(tau * tau for tau in right) / n,
+            sum(tau * tau for tau in left) / n,
+            max(map(abs, right)),
+            max(map(abs, left)),
+            float(self._limited_count),
+        )
+        self._torques.clear()
+        self._limited_count = 0
+
+    def _want(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Returns the torques for the torque period that begins at `time_ns`, none if no acceleration was heard."""
+        command, state, robot = heard[0], self.state, self._plan
+        right = left = 0.0
+        limited = False
+        if command is None:
+            self._heard = (0.0, 0.0)
+            self._limits.tau_right = self._limits.tau_left = 0.0
+        else:
+            ax, ay = self._heard = command.values[self._at : self._at + 2].tolist()
+            try:
+                right, left = self._inverse(state, ax, ay, 0.5 * self._h)
+            except (ValueError, OverflowError):
+                right = left = nan
+            if self._limited:
+                right, left, limited = self._limits.apply(right, left, state.v, state.omega, self._h)
+        self._limited_count += limited
+        turning = robot.arm * state.omega
+        speeds = (state.v + turning) / robot.wheel_radius, (state.v - turning) / robot.wheel_radius
+        values = np.array((right, left, float(command is not None), float(limited), *speeds))
+        return (Message(Channel.TORQUE, self.index, time_ns // robot.torque_period_ns, time_ns, values),)
+
+
+def make_robot(plan: Plan, index: int) -> Robot:
+    """Returns a robot's role, as the plan's torque path wants it."""
+    return RobotOnBus(plan, index) if plan.can.closed else Robot(plan, index)

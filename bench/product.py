@@ -38,7 +38,7 @@ def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float
             Path(folder),
             run=f"bench-{time.monotonic_ns():x}",
             virtual=True,
-            can_url=resolve_url("auto") if can else "",
+            can_urls=(resolve_url("auto"),) if can else (),
             scenario_toml=effective_toml(scenario),
             recorded=recorded,
         ).run()
@@ -59,7 +59,7 @@ def lab_in_process(*, whole: bool) -> float:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             display = Display(plan, quiet=True)
             done = execute(
-                scenario, plan, Path(folder), engine="inprocess", clock="virtual", can_url="virtual", display=display
+                scenario, plan, Path(folder), engine="inprocess", clock="virtual", can_urls=("virtual",), display=display
             )
         return float(done.summary["run"]["real_time_factor"])
     engine = Engine(plan)

@@ -102,7 +102,7 @@ class Bridge:
         """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
         counts = self.counts[robot]
         counts.stopped[why] = counts.stopped.get(why, 0) + 1
-        data, _ = self._codec.encode(robot, 0.0, 0.0, self._counters[robot], enable=False)
+        data, _ = self._codec.encode(robot, 0.0, 0.0, self._counters[robot], enable=(False, False))
         return self._send(robot, data)
 
     def _send(self, robot: int, data: bytes) -> list[Frame]:

@@ -31,6 +31,7 @@ DEFAULT_PORT = 43113
 DEFAULT_INTERFACE = "vcan0"
 
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of linux/can.h
+_REMOTE = 0x40000000  # CAN_RTR_FLAG
 _BUFFER = 4 << 20
 _TRIES = 10
 _PAUSE = 0.0005  # [s]; with _TRIES, one full queue holds the caller up for 5 ms at most
@@ -71,10 +72,14 @@ class _Address:
         return f"{self.interface}:{group}:{self.port}"
 
 
-def resolve_url(url: str) -> str:
+def resolve_url(url: str, number: int = 0) -> str:
     """The URL in full, with what `auto` stands for here and now, to be handed to all processes that share the bus.
 
-    Raises ValueError for a URL that is none."""
+    Of several buses number 1 looks for vcan1, and so on. Raises ValueError for a URL that is none."""
+    if url == "auto" and number:
+        return resolve_url(
+            f"socketcan:vcan{number}" if interface_is_up(f"vcan{number}") else f"udp_multicast::{_free_port()}"
+        )
     return str(_parse(url))
 
 
@@ -184,17 +189,18 @@ class Bus:
         kind, _, rest = self.url.partition(":")
         return rest if kind == "socketcan" else kind
 
-    def send(self, can_id: int, data: bytes, time_ns: int = 0) -> bool:
-        """Sends a frame; false if it was not accepted, which is counted. Blocks for 5 ms at most.
+    def send(self, can_id: int, data: bytes, time_ns: int = 0, remote: bool = False) -> bool:
+        """Sends a frame, a remote one if `remote`; false if it was not accepted, which is counted. Blocks for 5 ms at most.
 
         `time_ns` is the time stamp that receivers on a virtual bus see; other buses put their own.
         Raises ValueError for an identifier of more than 11 bits or more than 8 bytes."""
         if can_id >> 11 or len(data) > 8:
             raise ValueError(f"no classic CAN frame with an 11-bit identifier: {can_id:#x}, {len(data)} bytes")
         if self._socket is not None:
-            return self._send_raw(self._socket, _FRAME.pack(can_id, len(data), data))
+            return self._send_raw(self._socket, _FRAME.pack(can_id | _REMOTE if remote else can_id, len(data), data))
         message = self._message
         message.arbitration_id, message.dlc, message.data = can_id, len(data), bytearray(data)
+        message.is_remote_frame = remote
         message.timestamp = time_ns * 1e-9
         try:
             self._bus.send(message, timeout=_TRIES * _PAUSE if self._tries > 1 else 0)
@@ -252,7 +258,15 @@ class Bus:
         if message is None:
             return None
         time_ns = round(message.timestamp * 1e9)
-        return Received(message.arbitration_id, bytes(message.data), time_ns, message.is_remote_frame)
+        data = b"" if message.is_remote_frame else bytes(message.data)
+        return Received(message.arbitration_id, data, time_ns, message.is_remote_frame)
+
+    def fileno(self) -> int:
+        """The file descriptor that is readable when there is something to receive. OSError on a virtual bus."""
+        try:
+            return self._bus.fileno()
+        except NotImplementedError as error:
+            raise OSError(f"{self.url} has no file descriptor") from error
 
     def close(self) -> None:
         """Closes the bus."""

@@ -60,22 +60,26 @@ def _check_length(length: int) -> None:
         raise ValueError(f"a classic CAN frame has 0 .. 8 bytes, not {length}")
 
 
-def frame_bits(can_id: int, data: bytes) -> int:
+def frame_bits(can_id: int, data: bytes, remote: bool = False) -> int:
     """Bits that this very frame takes on the bus: stuffing as it really happens, and 3 bits of interframe space.
 
-    Raises ValueError for an identifier of more than 11 bits or more than 8 bytes."""
+    A remote frame has the RTR bit set and no data; its length code is taken to be 0.
+    Raises ValueError for an identifier of more than 11 bits, more than 8 bytes, or a remote frame with data."""
     if not 0 <= can_id < 0x800:
         raise ValueError(f"identifier must have 11 bits, not {can_id:#x}")
     _check_length(len(data))
+    if remote and data:
+        raise ValueError(f"a remote frame has no data, not {len(data)} bytes")
     # start of frame (0), identifier, RTR, IDE and r0 (0) and length code: 19 bits, here behind five zeros, which leave
     # a CRC that starts with zero as it is
-    head = (can_id << 7 | len(data)).to_bytes(3, "big")
+    start = can_id << 7 | remote << 6 | len(data)
+    head = start.to_bytes(3, "big")
     crc = 0
     for byte in head + data:
         crc = (crc << 8 & 0x7FFF) ^ _CRC[crc >> 7 ^ byte]
     # all that is stuffed: 34 + 8 n bits, two of which come before the whole bytes
     length = 34 + 8 * len(data)
-    bits = (can_id << 7 | len(data)) << (length - 19) | int.from_bytes(data, "big") << 15 | crc
+    bits = start << (length - 19) | int.from_bytes(data, "big") << 15 | crc
     # start of frame is 0, then comes the identifier's highest bit: a run of one 1, or of two 0
     state = 8 + 1 if bits >> (length - 2) else 2
     total = length + _TAIL

@@ -7,14 +7,18 @@ which log2asc, canplayer, `cantools decode` and python-can's LogReader read.
 
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
+
+from bridge.frame import Frame
 
 FLUSH_NS = 100_000_000  # what a killed process may lose, at most twice this while frames come
 _MAX_LINES = 4096
-_LINE = re.compile(r"\((\d+)\.(\d{6})\) \S+ ([0-9A-F]{3})#((?:[0-9A-F]{2}){0,8})")
+_LINE = re.compile(r"\((\d+)\.(\d{6})\) (\S+) ([0-9A-F]{3})#(?:(R)[0-8]?|((?:[0-9A-F]{2}){0,8}))(?: [RT])?")
 
 
 @dataclass(slots=True)
@@ -47,14 +51,17 @@ class CanLog:
         self.counts = LogCounts()
         self.error: OSError | None = None  # the last one
 
-    def write(self, time_ns: int, can_id: int, data: bytes, wall_ns: int) -> None:
-        """Notes a frame at `time_ns` of the run.
+    def write(
+        self, time_ns: int, can_id: int, data: bytes, wall_ns: int, channel: str = "", remote: bool = False
+    ) -> None:
+        """Notes a frame at `time_ns` of the run; `channel` is the bus if it is not the log's only one.
 
         `wall_ns` is any monotonic clock now: what is older than 0.1 s by it, or more than 4096 lines, goes to the file.
         When frames stop coming, call `flush`."""
         micros = (time_ns + self._epoch_ns) // 1000
         seconds, micros = divmod(micros, 1_000_000)
-        self._lines.append(f"({seconds:010d}.{micros:06d}) {self._channel} {can_id:03X}#{data.hex().upper()}\n")
+        content = "R" if remote else data.hex().upper()
+        self._lines.append(f"({seconds:010d}.{micros:06d}) {channel or self._channel} {can_id:03X}#{content}\n")
         if self._flushed_ns is None:
             self._flushed_ns = wall_ns
         elif wall_ns - self._flushed_ns >= FLUSH_NS or len(self._lines) >= _MAX_LINES:
@@ -116,20 +123,31 @@ class CanLog:
         self.close()
 
 
-def read_frames(path: Path, count: int) -> list[tuple[int, int, bytes]]:
-    """Returns the first `count` frames of a log as (time [ns], identifier, data); lines that are none are passed over.
+class Logged(NamedTuple):
+    """A frame in a log: time [ns], the bus's name, the frame."""
 
-    A log that is not there has no frames."""
-    frames: list[tuple[int, int, bytes]] = []
+    time_ns: int
+    channel: str
+    frame: Frame
+
+
+def read_log(path: Path) -> Iterator[Logged]:
+    """Yields the classic frames with 11-bit identifiers of a log as candump writes it; other lines are passed over.
+
+    Raises OSError if the log cannot be read."""
+    with path.open(encoding="ascii", errors="replace") as lines:
+        for line in lines:
+            if match := _LINE.fullmatch(line.strip()):
+                seconds, micros, channel, identifier, remote, data = match.groups()
+                time_ns = int(seconds) * 1_000_000_000 + int(micros) * 1000
+                frame = Frame(int(identifier, 16) & 0x7FF, bytes.fromhex(data or ""), remote is not None)
+                yield Logged(time_ns, channel, frame)
+
+
+def read_frames(path: Path, count: int) -> list[tuple[int, int, bytes]]:
+    """Returns the first `count` data frames of a log as (time [ns], identifier, data); none if there is no log."""
     try:
-        with path.open(encoding="ascii", errors="replace") as lines:
-            for line in lines:
-                if match := _LINE.fullmatch(line.strip()):
-                    seconds, micros, identifier, data = match.groups()
-                    time_ns = int(seconds) * 1_000_000_000 + int(micros) * 1000
-                    frames.append((time_ns, int(identifier, 16), bytes.fromhex(data)))
-                    if len(frames) == count:
-                        break
+        frames = (logged for logged in read_log(path) if not logged.frame.remote)
+        return [(logged.time_ns, logged.frame.can_id, logged.frame.data) for logged in islice(frames, count)]
     except OSError:
-        pass
-    return frames
+        return []

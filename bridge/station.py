@@ -1,6 +1,7 @@
 """The bridge at work: robots' states in; frames out, on the bus, in can.log, and as copies for the recorder."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,17 +9,17 @@ import numpy as np
 
 from bridge.bridge import Bridge
 from bridge.bus import listen_command, open_bus
-from bridge.bus_load import bus_load, explain
+from bridge.bus_load import bus_load
 from bridge.canlog import CanLog
-from bridge.dbc import torque_dbc
+from bridge.fit import describe_fit
+from bridge.frame_message import BRIDGE_NODE, add_words
+from bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
 TAU_RIGHT: Final = STATE_FIELDS.index("tau_right")
 TAU_LEFT: Final = STATE_FIELDS.index("tau_left")
 SATURATED: Final = STATE_FIELDS.index("saturated")
-LOG_CHANNEL: Final = "can0"
-"""Name of the bus in can.log, whatever it was: logs of the same run are the same."""
 
 
 class Station:
@@ -27,15 +28,17 @@ class Station:
     Raises ValueError or OSError if the bus or the files cannot be had.
     """
 
-    def __init__(self, plan: Plan, url: str, folder: Path, epoch_ns: int = 0) -> None:
+    def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
         robots = [robot.path for robot in plan.robots]
         self._plan = plan
         self._bridge = Bridge(robots, plan.can.torque_scale, [robot.period_ns for robot in plan.robots])
-        self._bus = open_bus(url)
-        self.url = self._bus.url
-        dbc = torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns)
-        (folder / "torque.dbc").write_text(dbc, encoding="utf-8")
-        self._log = CanLog(folder / "can.log", LOG_CHANNEL, epoch_ns)
+        self._buses = [open_bus(url) for url in urls]
+        self.url = ", ".join(bus.url for bus in self._buses)
+        for number, name in enumerate(dbc_names(plan)):
+            (folder / name).write_text(plan_dbc(plan, number), encoding="utf-8")
+        self._log = CanLog(folder / "can.log", plan.can.buses[0].name, 0)
+        self._bus_of = [robot.drive.bus for robot in plan.robots]
+        self._names = [bus.name for bus in plan.can.buses]
         self._source = len(plan.members)
         self._sequence = 0
         self._time_ns = 0
@@ -47,7 +50,7 @@ class Station:
         """
         copies: list[Message] = []
         words: list[int] = []
-        bus, log, encode = self._bus, self._log, self._bridge.encode
+        buses, names, log, encode = self._buses, self._names, self._log, self._bridge.encode
         wall_ns = time.monotonic_ns()
         for channel, source, _, time_ns, values in messages:
             if channel is not Channel.STATE or time_ns == 0:
@@ -58,10 +61,11 @@ class Station:
             frames = encode(
                 time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
             )
+            number = self._bus_of[source]
             for identifier, data in frames:
-                bus.send(identifier, data, time_ns)
-                log.write(time_ns, identifier, data, wall_ns)
-                words += (identifier, int.from_bytes(data, "little"))
+                buses[number].send(identifier, data, time_ns)
+                log.write(time_ns, identifier, data, wall_ns, names[number])
+                add_words(words, time_ns, number, BRIDGE_NODE, identifier, data)
         self._copy(words, copies)
         return copies
 
@@ -70,9 +74,10 @@ class Station:
         self._log.flush()
 
     def close(self) -> None:
-        """Closes log and bus."""
+        """Closes log and buses."""
         self._log.close()
-        self._bus.close()
+        for bus in self._buses:
+            bus.close()
 
     def progress(self) -> dict[str, Any]:
         """Returns what a live table shows."""
@@ -82,20 +87,20 @@ class Station:
         """Returns the counts of bridge, bus and log, and the load this would be on a real bus, for the summary."""
         bits = self._bridge.bits / self._bridge.frames if self._bridge.frames else 0.0
         robots = self._bridge.summary()
-        rate = 1e9 / self._plan.robots[0].period_ns
         return {
             "url": self.url,
-            "listen": listen_command(self.url),
-            "bitrate": self._plan.can.bitrate,
+            "path": "mirror",
+            "listen": "; ".join(command for bus in self._buses if (command := listen_command(bus.url))),
+            "bitrate": self._plan.can.buses[0].bitrate,
             "torque_scale": self._plan.can.torque_scale,
             "frames": self._bridge.frames,
             "clipped": sum(robot["clipped"] for robot in robots["robots"].values()),
             "load_mean": self._load(),
             "bits_per_frame": bits,
-            "fit": explain(len(self._plan.robots), rate, self._plan.can.bitrate, bits) if bits else "",
-            "sent": self._bus.counts.sent,
-            "failed": self._bus.counts.failed,
-            "dropped": self._bus.counts.dropped,
+            "fit": "; ".join(describe_fit(self._plan)) if self._bridge.frames else "",
+            "sent": sum(bus.counts.sent for bus in self._buses),
+            "failed": sum(bus.counts.failed for bus in self._buses),
+            "dropped": sum(bus.counts.dropped for bus in self._buses),
             "log_lost": self._log.counts.lost,
             "log_error": str(self._log.error) if self._log.error else None,
             "robots": robots["robots"],
@@ -108,7 +113,7 @@ class Station:
             return 0.0
         return bus_load(
             self._bridge.frames * 1e9 / self._time_ns,
-            self._plan.can.bitrate,
+            sum(bus.bitrate for bus in self._plan.can.buses),
             self._bridge.bits / max(self._bridge.frames, 1),
         )
 

@@ -99,8 +99,9 @@ def parser() -> argparse.ArgumentParser:
     recover.add_argument("file", type=Path, help="an MCAP file")
     recover.add_argument("--out", type=Path, metavar="FILE", help="where to write it (default: <file>-recovered.mcap)")
 
-    dbc = add("dbc", "print the DBC of a scenario's torque frames, for cantools, SavvyCAN and the like")
+    dbc = add("dbc", "print the DBC of a scenario's drives, for cantools, SavvyCAN and the like")
     scenario(dbc)
+    dbc.add_argument("--bus", metavar="NAME", help="which of the scenario's buses, if it has several")
     return top
 
 

@@ -109,7 +109,7 @@ class Link:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
         period = self.plan.period_ns
         if self._ideal:
-            return time_ns // period
+            return (time_ns - self.plan.first_ns) // period
         while self._sent * period <= time_ns:
             delay = self.fate(self._sent)
             if delay is None:

@@ -3,6 +3,8 @@
 Data flow makes the lockstep: at time t a stage needs, of each input, exactly the message its link says is in use at t.
 The link knows that number without having seen the message, so the mailbox can say what is still missing, and a stage
 that runs has heard the same whatever the order, the speed or the process in which messages came.
+
+A message that is older than its link's timeout (policy `hold_then_stop`) is as if it had not come.
 """
 
 from dataclasses import dataclass, field
@@ -31,6 +33,10 @@ class _Slot:
     period_ns: int
     many: int
     """More messages than this cannot all be in flight: those that the link loses are then forgotten."""
+    first_ns: int
+    timeout_ns: int
+    size: int | None
+    """Values of a message that says something; None if that varies."""
     lead_ns: int
     """So far the role may be ahead of the newest message that has come, whatever the link does with it."""
     current: Message | None = None
@@ -44,7 +50,7 @@ class Mailbox:
     """All inputs of one role; with `paced`, it misses something too while it is `LEAD` ahead of a source."""
 
     def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
-        members = plan.members
+        members = plan.everyone
         receiver = members[role.index].name
         tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._slots = {
@@ -53,6 +59,9 @@ class Mailbox:
                 link.ideal,
                 link.period_ns,
                 2 * (link.delay_max_ns // link.period_ns) + SLACK,
+                link.first_ns,
+                link.timeout_ns,
+                link.size,
                 max(LEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns) if paced else _NO_LIMIT,
             )
             for link in plan.links_into(role.index)
@@ -60,6 +69,8 @@ class Mailbox:
         self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
         self.unexpected = 0
         """Messages that no link of this role accounts for."""
+        self.misshapen = 0
+        """Messages with a number of values that their channel does not have."""
 
     def _slot(self, slot_input: Input) -> _Slot:
         return self._slots[slot_input.channel, slot_input.source]
@@ -69,6 +80,8 @@ class Mailbox:
         slot = self._slots.get((message.channel, message.source))
         if slot is None:
             self.unexpected += 1
+        elif message.values.size != slot.size and message.values.size and slot.size is not None:
+            self.misshapen += 1
         elif message.sequence > slot.in_use:
             slot.newer[message.sequence] = message
             if message.sequence > slot.newest:
@@ -79,7 +92,7 @@ class Mailbox:
         waiting = []
         for slot in self._stage_slots[stage]:
             if slot.ideal:
-                number = time_ns // slot.period_ns
+                number = (time_ns - slot.first_ns) // slot.period_ns
             else:
                 number = slot.link.newest(time_ns)
                 if slot.newest * slot.period_ns < time_ns - slot.lead_ns:
@@ -98,7 +111,9 @@ class Mailbox:
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
             newer = slot.newer
-            slot.wanted = number = time_ns // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
+            slot.wanted = number = (
+                (time_ns - slot.first_ns) // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
+            )
             if newer:
                 if number not in newer and number > slot.in_use:
                     number = self._newest_come(slot, time_ns)
@@ -111,7 +126,7 @@ class Mailbox:
                 elif len(newer) > slot.many:
                     slot.newer = {each: newer[each] for each in newer if slot.link.fate(each) is not None}
             current = slot.current
-            if current is None or not current.values.size:
+            if current is None or not current.values.size or time_ns - current.time_ns > slot.timeout_ns:
                 heard.append(None)
             else:
                 slot.link.note_use(time_ns, current.sequence, current.time_ns)

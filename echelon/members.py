@@ -6,7 +6,8 @@ from math import isfinite, radians
 from typing import Any, Final
 
 from echelon import shapes
-from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
+from echelon.drives import DriveMaker, make_can
+from echelon.plan import CanPlan, NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.scenario import Group, RobotTable, Scenario, Shape
 
 ROBOT_DEFAULTS: Final[dict[str, Any]] = {
@@ -32,18 +33,22 @@ def nanoseconds(seconds: float, key: str) -> int:
     return round(exact)
 
 
-def make_members(scenario: Scenario) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...]]:
-    """Returns robots and nodes by their numbers.  Raises PlanError."""
+def make_members(scenario: Scenario) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...], CanPlan]:
+    """Returns robots and nodes by their numbers, and the buses that the robots' drives are on.  Raises PlanError."""
     count = _count_robots(scenario.formation)
     if count > MAX_ROBOTS:
         raise PlanError(f"formation: {count} robots, but a bus has identifiers for {MAX_ROBOTS}")
+    torque_ns = nanoseconds(scenario.periods.torque, "periods.torque")
+    can = make_can(scenario.can, torque_ns)
     walk = _Walk(
         acceleration_ns=nanoseconds(scenario.periods.acceleration, "periods.acceleration"),
-        torque_ns=nanoseconds(scenario.periods.torque, "periods.torque"),
+        torque_ns=torque_ns,
         first_node=count,
+        drives=DriveMaker(scenario.can, can),
+        closed=can.closed,
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
-    return tuple(walk.robots), tuple(walk.nodes)
+    return tuple(walk.robots), tuple(walk.nodes), can
 
 
 def robot_key(path: str) -> str:
@@ -74,8 +79,9 @@ class _Place:
 class _Walk:
     """One walk through the tree; robots are numbered when they are met, nodes after all that is below them."""
 
-    def __init__(self, acceleration_ns: int, torque_ns: int, first_node: int) -> None:
+    def __init__(self, acceleration_ns: int, torque_ns: int, first_node: int, drives: DriveMaker, closed: bool) -> None:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
+        self._drives, self._closed = drives, closed
         self.robots: list[RobotPlan] = []
         self.nodes: list[NodePlan] = []
 
@@ -133,8 +139,12 @@ class _Walk:
                 f"{place.key}.inertia = {values['inertia']}: must be larger than mass·offset² = {least:.6g}"
             )
         assert place.parent is not None
+        index = len(self.robots)
+        cycle_ns = self._torque_ns if self._closed else period_ns
         return RobotPlan(
-            index=len(self.robots),
+            index=index,
+            envelope=self._drives.envelope(values),
+            drive=self._drives.drive(values, place.key, index, place.path, cycle_ns),
             path=place.path,
             parent=place.parent,
             child_number=place.child_number,
@@ -145,8 +155,11 @@ class _Walk:
 
 
 def _overlaid(table: RobotTable, over: RobotTable) -> RobotTable:
-    """Returns a table with what another says in its place."""
-    return table.model_copy(update=over.model_dump(exclude_none=True))
+    """Returns a table with what another says in its place, key by key in the tables within."""
+    merged = table.model_dump(exclude_none=True)
+    for key, value in over.model_dump(exclude_none=True).items():
+        merged[key] = merged.get(key, {}) | value if isinstance(value, dict) else value
+    return RobotTable(**merged)
 
 
 def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:

@@ -32,7 +32,12 @@ class Channel(IntEnum):
     COMMAND = 4
     """Group leader to its robots: an acceleration (x, y) per child."""
     FRAMES = 5
-    """Bridge to those who watch: per CAN frame two values whose bits are its identifier and its eight data bytes."""
+    """Bridge and drives to each other and to those who watch: CAN frames with their times (bridge.frame_message)."""
+    TORQUE = 6
+    """Robot to bridge, on the closed torque path: `TORQUE_FIELDS`.  The drives take the speeds of their shafts from it."""
+    WHEELS = 7
+    """Bridge to robots, on the closed torque path: the torques of every robot's right and left wheel [N m], the mean over
+    the torque period that ends at the message's time, as the drives reported them."""
 
 
 STATE_FIELDS: Final = (
@@ -47,6 +52,10 @@ STATE_FIELDS: Final = (
 speed [m/s], yaw rate [rad/s]; and what it did in the period that ends there: the acceleration it was commanded [m/s²],
 and of each wheel's torque the mean [N m], the mean square [N² m²] and the largest magnitude [N m] over the inner torque
 periods, and how many of those were saturated."""
+
+TORQUE_FIELDS: Final = ("tau_right", "tau_left", "commanded", "saturated", "speed_right", "speed_left")
+"""What a robot wants of its wheels: torques [N m], 0 where `commanded` is 0, for then it has nothing to go by; whether
+they were limited; and what its body does with the wheels meanwhile: their speeds [rad/s]."""
 
 GROUP_FIELDS: Final = ("x", "y", "vx", "vy")
 """A group's centroid [m] and its velocity [m/s]."""

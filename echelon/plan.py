@@ -15,6 +15,8 @@ from echelon.messages import Channel
 
 Array = NDArray[np.float64]
 COORDINATOR = "coordinator"
+NEVER_NS = 1 << 62
+"""Later than any instant of a run."""
 
 
 class PlanError(Exception):
@@ -219,6 +221,12 @@ class LinkPlan:
     delay_max_ns: int = 0
     loss: float = 0.0
     policy: str = "hold"
+    timeout_ns: int = NEVER_NS
+    """Age beyond which a message is not used any more (policy `hold_then_stop`)"""
+    first_ns: int = 0
+    """Instant of message number 0: before the run begins where drives are brought up"""
+    size: int | None = None
+    """How many values a message has that says something (echelon.layout); None: any number"""
 
     @property
     def ideal(self) -> bool:
@@ -227,13 +235,68 @@ class LinkPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class CanPlan:
-    """The bus: where, how fast, how many newton metres a bit of torque is."""
+class BusPlan:
+    """A CAN bus: its name, where it is, how fast [bit/s]."""
 
-    enabled: bool
+    name: str
     url: str
     bitrate: int
+
+
+@dataclass(frozen=True, slots=True)
+class CanPlan:
+    """The buses, and the way of the torques: `mirror` or `closed`, frames taking time as on a real bus (`bits`) or none."""
+
+    enabled: bool
+    buses: tuple[BusPlan, ...]
     torque_scale: float
+    path: str
+    timing: str
+    virtual_drives: bool
+    watchdog_ns: int
+    bring_up_ns: int
+    queue: int
+    restart_ns: int
+
+    @property
+    def closed(self) -> bool:
+        """True if the plant takes its torque from the drives."""
+        return self.path == "closed"
+
+
+@dataclass(frozen=True, slots=True)
+class EventPlan:
+    """Something that happens from `at_ns` until `until_ns`: a kind and what it needs (echelon.can_tables)."""
+
+    kind: str
+    at_ns: int
+    until_ns: int
+    robots: tuple[int, ...] = ()
+    wheels: tuple[int, ...] = (0, 1)
+    fault: str = ""
+    buses: tuple[int, ...] = ()
+    rate: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StationPlan:
+    """A process between robots and their wheels, on the closed torque path: the bridge, or the virtual drives."""
+
+    index: int
+    role: str
+    period_ns: int
+    first_ns: int
+    """When it begins, before the run: drives are brought up until 0"""
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        return self.role
+
+    @property
+    def path(self) -> str:
+        """Its place among the keys, which no group can have."""
+        return f"@{self.role}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,6 +329,9 @@ class Plan:
     links: tuple[LinkPlan, ...]
     can: CanPlan
     claims: tuple[ClaimPlan, ...]
+    events: tuple[EventPlan, ...] = ()
+    stations: tuple[StationPlan, ...] = ()
+    """Bridge and drives, in this order, where the torque path is closed; numbered after the nodes"""
 
     @property
     def root(self) -> NodePlan:
@@ -281,6 +347,11 @@ class Plan:
     def members(self) -> tuple[RobotPlan | NodePlan, ...]:
         """Robots and nodes by index."""
         return (*self.robots, *self.nodes)
+
+    @property
+    def everyone(self) -> "tuple[RobotPlan | NodePlan | StationPlan, ...]":
+        """Robots, nodes and stations by index."""
+        return (*self.robots, *self.nodes, *self.stations)
 
     def links_into(self, receiver: int) -> tuple[LinkPlan, ...]:
         """The links that end at a member."""

@@ -11,10 +11,13 @@ from math import dist
 from typing import Final
 
 from echelon.blocks import fitting, make_blocks, make_coupling
+from echelon.drives import make_events
+from echelon.layout import sized
 from echelon.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
 from echelon.messages import Channel
 from echelon.plan import (
     COORDINATOR,
+    NEVER_NS,
     AvoidancePlan,
     CanPlan,
     ClaimPlan,
@@ -23,9 +26,11 @@ from echelon.plan import (
     Plan,
     PlanError,
     RobotPlan,
+    StationPlan,
     TrajectoryPlan,
 )
 from echelon.scenario import LinkRule, Scenario, Uniform
+from echelon.values import path_matches
 
 MAX_DELAY: Final = 1e6
 """[s]"""
@@ -35,7 +40,8 @@ SHOWN_NAMES: Final = 12
 
 def make_plan(scenario: Scenario) -> Plan:
     """Returns the plan of a scenario.  Raises PlanError."""
-    robots, nodes = make_members(scenario)
+    robots, nodes, can = make_members(scenario)
+    stations = _stations(robots, nodes, can)
     _check_starts(robots, scenario.avoidance.avoidance_radius if scenario.avoidance.enabled else 0.0)
     duration_ns = nanoseconds(scenario.duration, "duration")
     if duration_ns % nodes[-1].period_ns:
@@ -45,7 +51,7 @@ def make_plan(scenario: Scenario) -> Plan:
     blocks = make_blocks(scenario.law, nodes)
     for at, claim in enumerate(scenario.claims):
         fitting(blocks, claim.block, f"claims.{at}.block")
-    return Plan(
+    plan = Plan(
         name=scenario.name,
         seed=scenario.seed,
         duration_ns=duration_ns,
@@ -57,10 +63,24 @@ def make_plan(scenario: Scenario) -> Plan:
         lead=scenario.law.lead,
         trajectory=TrajectoryPlan(scenario.trajectory.kind, scenario.trajectory.model_dump(exclude={"kind"})),
         avoidance=AvoidancePlan(**scenario.avoidance.model_dump()),
-        links=_links(scenario.links, robots, nodes),
-        can=CanPlan(**scenario.can.model_dump()),
+        links=_links(scenario.links, robots, nodes, stations, can),
+        can=can,
         claims=tuple(ClaimPlan(claim.block, claim.settled_by, claim.band) for claim in scenario.claims),
+        events=make_events(scenario.events, robots, can),
+        stations=stations,
     )
+    return sized(plan)
+
+
+def _stations(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[StationPlan, ...]:
+    """Returns bridge and drives where the torque path is closed."""
+    if not can.closed:
+        return ()
+    if not can.enabled:
+        raise PlanError("can.enabled = false: must be true where can.path = 'closed'")
+    first, cycle_ns = len(robots) + len(nodes), robots[0].torque_period_ns
+    roles = ("bridge", "drives") if can.virtual_drives else ("bridge",)
+    return tuple(StationPlan(first + at, role, cycle_ns, -can.bring_up_ns) for at, role in enumerate(roles))
 
 
 def _check_starts(robots: Sequence[RobotPlan], radius: float) -> None:
@@ -77,30 +97,62 @@ def _check_starts(robots: Sequence[RobotPlan], radius: float) -> None:
             )
 
 
-def _links(rules: Sequence[LinkRule], robots: Sequence[RobotPlan], nodes: Sequence[NodePlan]) -> tuple[LinkPlan, ...]:
-    """Lists the tree's links, receiver by receiver, and gives each what the last fitting rule says."""
-    members: list[RobotPlan | NodePlan] = [*robots, *nodes]
-    names = [member.name for member in members]
+def _links(
+    rules: Sequence[LinkRule],
+    robots: Sequence[RobotPlan],
+    nodes: Sequence[NodePlan],
+    stations: Sequence[StationPlan],
+    can: CanPlan,
+) -> tuple[LinkPlan, ...]:
+    """Lists all links, receiver by receiver, and gives those between members what the last fitting rule says."""
+    everyone: list[RobotPlan | NodePlan | StationPlan] = [*robots, *nodes, *stations]
+    names = [one.name for one in everyone]
     limits = [_delay_ns(rule, f"links.{at}.delay") for at, rule in enumerate(rules)]
     used: set[int] = set()
     links = []
-    for source, receiver, channel, period_ns in _tree_links(robots, nodes):
-        link = LinkPlan(source, receiver, channel, period_ns)
-        for at, (rule, (delay_min_ns, delay_max_ns)) in enumerate(zip(rules, limits, strict=True)):
+    for source, receiver, channel, period_ns in [*_tree_links(robots, nodes), *_torque_links(robots, stations)]:
+        rule, delay_min_ns, delay_max_ns = LinkRule(), 0, 0
+        for at, (each, limit) in enumerate(zip(rules, limits, strict=True)):
             if (
-                rule.channel in ("*", channel.name.lower())
-                and path_matches(rule.source, names[source])
-                and path_matches(rule.receiver, names[receiver])
+                each.channel in ("*", channel.name.lower())
+                and path_matches(each.source, names[source])
+                and path_matches(each.receiver, names[receiver])
             ):
                 used.add(at)
-                link = LinkPlan(
-                    source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, rule.policy
-                )
-        links.append(link)
+                rule, (delay_min_ns, delay_max_ns) = each, limit
+        policy, timeout_ns = rule.policy or ("hold_then_stop" if can.closed else "hold"), NEVER_NS
+        if policy == "hold_then_stop":
+            # What comes more rarely than that is not late when it is that old.
+            wanted = can.watchdog_ns if rule.timeout is None else round(rule.timeout * 1e9)
+            timeout_ns = max(wanted, 2 * period_ns) if rule.timeout is None else wanted
+        links.append(
+            LinkPlan(source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, policy, timeout_ns)
+        )
     for at, rule in enumerate(rules):
         if at not in used:
-            raise PlanError(_why_unused(rule, f"links.{at}", names))
-    return tuple(links)
+            raise PlanError(_why_unused(rule, f"links.{at}", names, bool(stations)))
+    return (*links, *_shaft_links(robots, stations))
+
+
+def _torque_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan]) -> list[tuple[int, int, Channel, int]]:
+    """Returns the links from robots to the bridge: over them go torques, and they can be late or lose."""
+    bridge = stations[:1]
+    return [(robot.index, to.index, Channel.TORQUE, to.period_ns) for to in bridge for robot in robots]
+
+
+def _shaft_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan]) -> list[LinkPlan]:
+    """Returns the links that stand for no network: shafts, and what the bus itself does (bridge.bus_time)."""
+    links: list[LinkPlan] = []
+    if not stations:
+        return links
+    bridge, drives = stations[0].index, [station.index for station in stations[1:]]
+    period_ns, first_ns = stations[0].period_ns, stations[0].first_ns
+    links += [LinkPlan(bridge, robot.index, Channel.WHEELS, period_ns) for robot in robots]
+    for index in drives:
+        links.append(LinkPlan(bridge, index, Channel.FRAMES, period_ns, first_ns=first_ns))
+        links.append(LinkPlan(index, bridge, Channel.FRAMES, period_ns, first_ns=first_ns))
+        links += [LinkPlan(robot.index, index, Channel.TORQUE, period_ns) for robot in robots]
+    return links
 
 
 def _tree_links(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan]) -> list[tuple[int, int, Channel, int]]:
@@ -125,7 +177,7 @@ def _delay_ns(rule: LinkRule, key: str) -> tuple[int, int]:
     return round(low * 1e9), round(high * 1e9)
 
 
-def _why_unused(rule: LinkRule, key: str, names: Sequence[str]) -> str:
+def _why_unused(rule: LinkRule, key: str, names: Sequence[str], closed: bool) -> str:
     """Returns why a rule fits no link."""
     for end, pattern in (("source", rule.source), ("receiver", rule.receiver)):
         if not any(path_matches(pattern, name) for name in names):
@@ -135,19 +187,8 @@ def _why_unused(rule: LinkRule, key: str, names: Sequence[str]) -> str:
     return (
         f"{key}: no link goes from {rule.source!r} to {rule.receiver!r} on channel {rule.channel!r}; links go from a "
         "node's child to it on 'state' or 'group_state', and back on 'command' or 'reference'"
+        + (", and from a robot to 'bridge' on 'torque'" if closed else "")
     )
-
-
-def path_matches(pattern: str, path: str) -> bool:
-    """True if a path fits a pattern chunk by chunk: `*` stands for one chunk, `**` for any number of them."""
-    chunks = path.split("/")
-    fitted = {0}  # how many of the path's chunks the pattern may have used up so far
-    for want in pattern.split("/"):
-        if want == "**":
-            fitted = set(range(min(fitted), len(chunks) + 1)) if fitted else fitted
-        else:
-            fitted = {at + 1 for at in fitted if at < len(chunks) and want in ("*", chunks[at])}
-    return len(chunks) in fitted
 
 
 __all__ = ["COORDINATOR", "MAX_ROBOTS", "PlanError", "make_plan", "path_matches"]

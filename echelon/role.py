@@ -31,10 +31,12 @@ class Stage:
     period_ns: int
     inputs: tuple[Input, ...]
     run: Callable[[int, Sequence[Heard]], tuple[Message, ...]]
+    first_ns: int = 0
+    """When it runs first; before the run where drives have to be brought up"""
 
 
 class Role(Protocol):
-    """A robot, a leader or a coordinator."""
+    """A robot, a leader, the coordinator; or a station between robots and their wheels."""
 
     @property
     def index(self) -> int:

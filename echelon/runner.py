@@ -90,7 +90,7 @@ class Runner:
     """One role of a plan, connected.  Declares everything it sends and receives when it is made."""
 
     def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool, virtual: bool) -> None:
-        members = plan.members
+        members = plan.everyone
         member = members[role.index]
         self.role, self.plan = role, plan
         self.mailbox = Mailbox(role, plan, paced=virtual)
@@ -112,7 +112,7 @@ class Runner:
         self._aside: deque[bytes] = deque()  # what came while the main thread had the lock
         self._wake = threading.Event()  # there is something for the main thread
         self._in_handler = False  # the handler may move the role; otherwise that is the main thread's turn
-        self._time_ns = 0
+        self._time_ns = min(stage.first_ns for stage in role.stages)
         self._at = 0
         self._moved = 0
         self._finished = False
@@ -213,14 +213,16 @@ class Runner:
         Within a period, stages have deadlines in the order of their levels; the last ends with the period.
         """
         assert self._inbox is not None
-        levels = max(node.depth for node in self.plan.nodes) * 2 + 3
+        # Stations between robots and wheels take turns before and after the members.
+        early, late = (3, 5) if self.plan.stations else (0, 3)
+        levels = early + max(node.depth for node in self.plan.nodes) * 2 + late
         mailbox, counts, take = self.mailbox, self.counts, self._inbox.take
         for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
             self._sleep_until(start_ns + time_ns)
             for number, stage in self._stages:
                 if time_ns % stage.period_ns:
                     continue
-                deadline_ns = start_ns + time_ns + stage.period_ns * stage.level // levels
+                deadline_ns = start_ns + time_ns + stage.period_ns * (early + stage.level) // levels
                 for payload in take(0):
                     self._deliver(payload)
                 while mailbox.missing(number, time_ns):
@@ -231,7 +233,7 @@ class Runner:
                     for payload in take(left_ns * 1e-9):
                         self._deliver(payload)
                 counts.stages += 1
-                if stage.level:
+                if stage.inputs:
                     counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns)
                 self._run_stage(number, stage, time_ns)
             if self._watch is not None:
@@ -249,6 +251,12 @@ class Runner:
         """Moves the role no more, and sends what is held back for those who watch."""
         with self._lock:
             self._finished = True
+            for reason, count in (
+                ("of no link of this role", self.mailbox.unexpected),
+                ("wrong number of values", self.mailbox.misshapen),
+            ):
+                if count:
+                    self.counts.refused[reason] = count
             if self._watch is not None:
                 self._watch.close()
         if self._watch is not None:

@@ -2,25 +2,36 @@
 
 A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
 then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.load`; the plan that roles work with
-is made in `echelon.planning`.
+is made in `echelon.planning`; what concerns the CAN bus stands in `echelon.can_tables`.
 """
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
-from echelon.values import CouplingGain, Finite, Flag, Fraction, Gain, Limit, Name, NonNegative, Point, Positive
+from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
+from echelon.values import (
+    CouplingGain,
+    Finite,
+    Flag,
+    Fraction,
+    Gain,
+    Limit,
+    Name,
+    NonNegative,
+    Point,
+    Positive,
+    Table,
+)
 from echelon.values import number_or_table as _number_or_table
 
-ChannelName = Literal["state", "group_state", "reference", "command", "*"]
+ChannelName = Literal["state", "group_state", "reference", "command", "torque", "*"]
 BLOCK_NAMES = ("intra", "middle", "inter", "centroid")
 """Names of blocks and layers of blocks, which groups therefore cannot have."""
 
 
-class Table(BaseModel):
-    """A TOML table: unknown keys are mistakes."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+RESERVED_NAMES = ("coordinator", "bridge", "drives", "recorder", "referee")
+"""Names of processes, which robots and groups therefore cannot have."""
 
 
 class Periods(Table):
@@ -57,6 +68,10 @@ class RobotTable(Table):
     """Largest change of a wheel's torque [N m/s]"""
     wheel_speed_limit: Limit | None = None
     """Wheel speed beyond which the motor gives no torque in the direction of motion [rad/s]"""
+    bus: Name | None = None
+    """Which of `can.buses` its drives are on; the first one unless given"""
+    drive: DriveTable | None = None
+    envelope: EnvelopeTable | None = None
 
 
 class Shape(Table):
@@ -102,8 +117,8 @@ class Group(Table):
             raise ValueError("a group needs robots or groups")
         if twice := sorted(self.robots.keys() & self.groups.keys()):
             raise ValueError(f"{twice[0]!r} names a robot and a group")
-        if "coordinator" in self.robots or "coordinator" in self.groups:
-            raise ValueError("'coordinator' is the name of the root")
+        if reserved := sorted((self.robots.keys() | self.groups.keys()) & set(RESERVED_NAMES)):
+            raise ValueError(f"{reserved[0]!r} is the name of a process that every run has")
         if taken := sorted(self.groups.keys() & set(BLOCK_NAMES)):
             raise ValueError(f"a group cannot be called {taken[0]!r}: {', '.join(BLOCK_NAMES)} are names of blocks")
         if len(self.robots) + len(self.groups) > 1 and self.shape is None:
@@ -244,20 +259,11 @@ class LinkRule(Table):
     """[s]"""
     loss: Fraction = 0.0
     """Probability that a message is lost, independent of all others"""
-    policy: Literal["hold"] = "hold"
-    """What a receiver uses if nothing newer has come: the last that came"""
-
-
-class Can(Table):
-    """The CAN bus."""
-
-    enabled: Flag = True
-    url: str = "auto"
-    """`socketcan:vcan0`, `udp_multicast:…`, `virtual`; `auto` takes vcan0 where it is up, else udp_multicast"""
-    bitrate: Annotated[int, Field(strict=True, ge=10_000, le=1_000_000)] = 1_000_000
-    """[bit/s], for the bus load"""
-    torque_scale: Positive = 0.001
-    """Newton metres per bit of the torque frame; ±32767 bits fit"""
+    policy: Literal["hold", "hold_then_stop"] | None = None
+    """What a receiver uses if nothing newer has come: the last that came, for ever or until it is older than `timeout`.
+    Unless given: `hold` where torque is mirrored, `hold_then_stop` where the torque path is closed"""
+    timeout: Positive | None = None
+    """For `hold_then_stop` [s]; `can.watchdog` unless given"""
 
 
 class Record(Table):
@@ -298,3 +304,5 @@ class Scenario(Table):
     can: Can = Can()
     record: Record = Record()
     claims: list[Claim] = []
+    events: list[Event] = []
+    """What happens on schedule, in run time"""

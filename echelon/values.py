@@ -1,8 +1,8 @@
-"""Kinds of values in a scenario, as pydantic checks them."""
+"""Kinds of values in a scenario, as pydantic checks them, and the table that holds them."""
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, Discriminator, Field, Tag
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
 # Numbers are strict: neither true nor "1.5" is one.
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -13,6 +13,8 @@ Fraction = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Flag = Annotated[bool, Field(strict=True)]
 Point = tuple[Finite, Finite]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+NodeId = Annotated[int, Field(strict=True, ge=0, le=127)]
+Bitrate = Annotated[int, Field(strict=True, ge=10_000, le=1_000_000)]
 Matrix = list[list[Finite]]
 
 
@@ -31,3 +33,21 @@ Gain = Annotated[
 CouplingGain = Annotated[
     Annotated[Finite, Tag("a number")] | Annotated[Matrix, Tag("an array")], Discriminator(number_or_array)
 ]
+
+
+def path_matches(pattern: str, path: str) -> bool:
+    """True if a path fits a pattern chunk by chunk: `*` stands for one chunk, `**` for any number of them."""
+    chunks = path.split("/")
+    fitted = {0}  # how many of the path's chunks the pattern may have used up so far
+    for want in pattern.split("/"):
+        if want == "**":
+            fitted = set(range(min(fitted), len(chunks) + 1)) if fitted else fitted
+        else:
+            fitted = {at + 1 for at in fitted if at < len(chunks) and want in ("*", chunks[at])}
+    return len(chunks) in fitted
+
+
+class Table(BaseModel):
+    """A TOML table: unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)

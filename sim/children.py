@@ -5,12 +5,13 @@ import os
 import signal
 import time
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from echelon.plan import Plan, RobotPlan
 from echelon.session import loopback_endpoints
@@ -20,8 +21,9 @@ from sim.process import main
 PRELOAD: Final = ["sim.process"]
 LAST_WORDS: Final = 4000
 """Bytes kept of what a process says on standard error."""
-WATCHERS: Final = ("bridge", "recorder")
-"""The kinds of processes that are no members, in the order in which they finish."""
+FINISHING: Final = ("bridge", "drives", "recorder")
+"""Processes that are told when to finish, in the order in which they are; bridge and drives keep step with the run by
+themselves where the torque path is closed and time is virtual."""
 
 
 @dataclass(slots=True)
@@ -47,8 +49,8 @@ class Child:
 
     @property
     def is_member(self) -> bool:
-        """True for robots, leaders and the coordinator; False for those who watch."""
-        return self.spec.kind not in WATCHERS
+        """True for those who are done when the run is; False for those who are told when to finish."""
+        return self.spec.member
 
     def hear_words(self) -> None:
         """Takes all that it has said on standard error and not been heard yet."""
@@ -114,56 +116,85 @@ def list_specs(
     run: str,
     virtual: bool,
     folder: Path,
-    can_url: str,
+    can_urls: tuple[str, ...],
     scenario_toml: str,
     metadata: dict[str, str],
     recorded: bool,
 ) -> list[ProcessSpec]:
-    """Lists the processes of a run: every node listens, its children connect; all members connect to the watchers."""
-    watchers = ([("recorder", "recorder")] if recorded else []) + ([("bridge", "bridge")] if can_url else [])
-    endpoints = loopback_endpoints(len(plan.nodes) + len(watchers))
-    endpoint = {node.index: endpoints.pop() for node in plan.nodes}
-    watcher_endpoint = {name: endpoints.pop() for _, name in watchers}
+    """Lists the processes of a run and who connects to whom.
+
+    Every node listens and its children connect; so does the recorder, to whom everyone connects.  To bridge and drives
+    robots connect, and the bridge to the drives.
+    """
+    stations = [station.role for station in plan.stations]
+    if can_urls and not stations:
+        stations = ["bridge"]
+    hubs = (["recorder"] if recorded else []) + stations
+    endpoints = loopback_endpoints(len(plan.nodes) + len(hubs))
+    at = {node.index: endpoints.pop() for node in plan.nodes}
+    hub_at = {hub: endpoints.pop() for hub in hubs}
+    recorder = ["recorder"] if recorded else []
+    common: dict[str, Any] = {
+        "run": run,
+        "plan": plan,
+        "virtual": virtual,
+        "folder": str(folder),
+        "can_urls": can_urls,
+        "scenario_toml": scenario_toml,
+        "metadata": metadata,
+    }
+
+    def with_hubs(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+        return tuple(hub_at[name] for name in names), tuple((name, name) for name in names)
+
     specs = []
     for member in plan.members:
-        peers = [] if member.parent is None else [member.parent]
-        peers += [] if isinstance(member, RobotPlan) else member.children
+        near = [] if member.parent is None else [member.parent]
+        near += [] if isinstance(member, RobotPlan) else member.children
+        endpoints_of, peers_of = with_hubs(recorder + (stations if isinstance(member, RobotPlan) else []))
         specs.append(
             ProcessSpec(
-                run=run,
                 kind=member.role,
                 name=member.name,
                 index=member.index,
-                plan=plan,
-                virtual=virtual,
-                listen=(endpoint[member.index],) if member.index in endpoint else (),
-                connect=(
-                    *(() if member.parent is None else (endpoint[member.parent],)),
-                    *watcher_endpoint.values(),
-                ),
-                peers=(*((plan.members[peer].role, plan.members[peer].name) for peer in peers), *watchers),
-                watched=bool(watchers),
+                listen=(at[member.index],) if member.index in at else (),
+                connect=(*(() if member.parent is None else (at[member.parent],)), *endpoints_of),
+                peers=(*((plan.members[peer].role, plan.members[peer].name) for peer in near), *peers_of),
+                watched=recorded or (bool(stations) and isinstance(member, RobotPlan) and not plan.stations),
+                **common,
             )
         )
-    everyone = tuple((member.role, member.name) for member in plan.members)
-    for watcher, name in watchers:
-        others = tuple(endpoint for other, endpoint in watcher_endpoint.items() if other != name)
+    robots = tuple((robot.role, robot.name) for robot in plan.robots)
+    for number, station in enumerate(stations):
+        later = stations[number + 1 :]
+        endpoints_of, _ = with_hubs(recorder + later)
+        others = tuple((name, name) for name in recorder + stations if name != station)
         specs.append(
             ProcessSpec(
-                run=run,
-                kind=watcher,
-                name=name,
-                index=len(plan.members),
-                plan=plan,
-                virtual=virtual,
-                listen=(watcher_endpoint[name],),
-                connect=others if watcher == "bridge" else (),
-                peers=(*everyone, *(one for one in watchers if one[1] != name)),
-                folder=str(folder),
-                can_url=can_url,
-                scenario_toml=scenario_toml,
-                metadata=metadata,
+                kind=station,
+                name=station,
+                index=len(plan.members) + number,
+                listen=(hub_at[station],),
+                connect=endpoints_of,
+                peers=(*robots, *others),
+                watched=recorded,
+                member=virtual and bool(plan.stations),
+                **common,
+            )
+        )
+    if recorded:
+        everyone = tuple((member.role, member.name) for member in plan.members)
+        specs.append(
+            ProcessSpec(
+                kind="recorder",
+                name="recorder",
+                index=len(plan.members) + len(stations),
+                listen=(hub_at["recorder"],),
+                connect=(),
+                peers=(*everyone, *((name, name) for name in stations)),
+                member=False,
+                **common,
             )
         )
     # Those that import most start first.
-    return sorted(specs, key=lambda spec: spec.kind not in WATCHERS)
+    return sorted(specs, key=lambda spec: spec.kind not in FINISHING)

@@ -6,6 +6,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +47,18 @@ def run(arguments: argparse.Namespace) -> int:
     from sim.run import execute, new_folder
     from sim.summary import summary_text
 
-    can_url = arguments.can or plan.can.url
-    if arguments.can == "none" or not (plan.can.enabled or arguments.can):
-        can_url = ""
-    if can_url == "auto" and arguments.engine == "inprocess":
-        can_url = "virtual"  # one process needs no bus to others; name one to be heard
-    if can_url:
-        can_url = _checked_bus(can_url)
+    can_urls = _bus_urls(plan, arguments.can, arguments.engine == "inprocess")
+    if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
+        raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
+    if arguments.clock == "virtual" and not plan.can.virtual_drives:
+        raise UsageError("can.virtual_drives = false: real drives need --clock wall")
     try:
         folder = new_folder(scenario, arguments.out)
     except OSError as error:
         raise UsageError(f"--out {arguments.out}: {error.strerror}") from None
     display = Display(plan, quiet=arguments.quiet)
     if not arguments.quiet:
-        display.say(_heading(plan, arguments, folder, can_url))
+        display.say(_heading(plan, arguments, folder, can_urls))
     try:
         finished = execute(
             scenario,
@@ -67,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
             folder,
             engine=arguments.engine,
             clock=arguments.clock,
-            can_url=can_url,
+            can_urls=can_urls,
             display=display,
             stall_timeout_s=arguments.stall_timeout,
         )
@@ -95,18 +94,39 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if finished.summary["verdict"]["holds"] else 1
 
 
-def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_url: str) -> str:
+def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_urls: Sequence[str]) -> str:
     robots, nodes = len(plan.robots), len(plan.nodes)
     how = "in one process" if arguments.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
-    bus = f", frames on {can_url}" if can_url else ""
-    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{bus}; into {folder}"
+    bus = f", frames on {', '.join(can_urls)}" if can_urls else ""
+    path = f", {plan.can.path} torque path" if plan.can.closed else ""
+    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{path}{bus}; into {folder}"
 
 
-def _checked_bus(url: str) -> str:
+def _bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:
+    """Returns where each of the plan's buses is, in full; none if there are to be no frames.  Raises UsageError.
+
+    `wanted` is what --can says: a URL for all buses, or one for each, with commas between."""
+    if wanted == "none" or not (plan.can.enabled or wanted):
+        return ()
+    urls = [bus.url for bus in plan.can.buses]
+    if wanted:
+        given = wanted.split(",")
+        if len(given) not in (1, len(urls)):
+            raise UsageError(f"--can {wanted}: {len(given)} of them for {len(urls)} buses")
+        urls = given * len(urls) if len(given) == 1 else given
+    if one_process:  # it needs no bus to others; name one to be heard
+        urls = [f"virtual:{bus.name}" if url == "auto" else url for url, bus in zip(urls, plan.can.buses, strict=True)]
+    resolved = tuple(_checked_bus(url, number) for number, url in enumerate(urls))
+    if len(set(resolved)) < len(resolved):
+        raise UsageError(f"--can {wanted or ','.join(urls)}: {len(resolved)} buses need as many places")
+    return resolved
+
+
+def _checked_bus(url: str, number: int = 0) -> str:
     from bridge.bus import interface_is_up, resolve_url
 
     try:
-        resolved = resolve_url(url)
+        resolved = resolve_url(url, number)
     except ValueError as error:
         raise UsageError(f"--can {url}: {error}") from None
     kind, _, name = resolved.partition(":")
@@ -117,10 +137,9 @@ def _checked_bus(url: str) -> str:
 
 def validate(arguments: argparse.Namespace) -> int:
     """`echelon validate`"""
-    from bridge.bus_load import explain
+    from bridge.fit import describe_fit
 
     scenario, plan = scenario_of(arguments)
-    rate = 1e9 / plan.robots[0].period_ns
     facts: dict[str, Any] = {
         "scenario": scenario.name,
         "robots": len(plan.robots),
@@ -128,7 +147,7 @@ def validate(arguments: argparse.Namespace) -> int:
         "duration": plan.duration_ns / 1e9,
         "ticks": plan.duration_ns // plan.robots[0].period_ns,
         "time_scales": {block.name: block.sigma for block in plan.blocks},
-        "can": explain(len(plan.robots), rate, plan.can.bitrate) if plan.can.enabled else "disabled",
+        "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
     }
     if arguments.json:
         print(json.dumps(facts, indent=2))
@@ -138,7 +157,8 @@ def validate(arguments: argparse.Namespace) -> int:
             f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks"
         )
         print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
-        print(f"  CAN  {facts['can']}")
+        for line in facts["can"]:
+            print(f"  CAN  {line}")
     return 0
 
 
@@ -234,11 +254,17 @@ def recover(arguments: argparse.Namespace) -> int:
 
 def dbc(arguments: argparse.Namespace) -> int:
     """`echelon dbc`"""
-    from bridge.dbc import torque_dbc
+    from bridge.plan_dbc import plan_dbc
 
     _, plan = scenario_of(arguments)
-    robots = [robot.path for robot in plan.robots]
-    sys.stdout.write(torque_dbc(robots, plan.can.torque_scale, plan.robots[0].period_ns))
+    names = [bus.name for bus in plan.can.buses]
+    if arguments.bus not in (None, *names):
+        raise UsageError(f"--bus {arguments.bus}: must be one of {', '.join(names)}")
+    if arguments.bus is None and len(names) > 1:
+        raise UsageError(
+            f"{arguments.scenario} has several buses, each with a DBC of its own: give --bus {' or '.join(names)}"
+        )
+    sys.stdout.write(plan_dbc(plan, 0 if arguments.bus is None else names.index(arguments.bus)))
     return 0
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from itertools import groupby
 from math import gcd
 
-from agents.robot import Robot
+from agents.robot import make_robot
 from controller.node import TreeNode
 from echelon.link import LinkCounts
 from echelon.mailbox import Mailbox
@@ -21,12 +21,19 @@ Sink = Callable[[Message], None]
 
 def make_roles(plan: Plan) -> list[Role]:
     """Returns the roles of a plan by index: robots, then nodes."""
-    return [make_role(plan, index) for index in range(len(plan.members))]
+    return [make_role(plan, index) for index in range(len(plan.everyone))]
 
 
 def make_role(plan: Plan, index: int) -> Role:
-    """Returns the role of one member."""
-    return Robot(plan, index) if index < len(plan.robots) else TreeNode(plan, index)
+    """Returns the role of a robot, a node, or a station between robots and their wheels."""
+    if index < len(plan.robots):
+        return make_robot(plan, index)
+    if index < len(plan.members):
+        return TreeNode(plan, index)
+    from bridge.commander import Commander  # the protocols of drives, for two processes alone
+    from bridge.drive_bank import DriveBank
+
+    return Commander(plan) if index == plan.stations[0].index else DriveBank(plan)
 
 
 class Engine:
@@ -43,22 +50,26 @@ class Engine:
             receivers.setdefault((link.source, link.channel), []).append(self.mailboxes[link.receiver])
         self._receivers = receivers
         stages = [
-            (stage.level, stage.period_ns, role.index, number, stage.run, self.mailboxes[role.index])
+            (stage.level, stage.period_ns, stage.first_ns, role.index, number, stage.run, self.mailboxes[role.index])
             for role in self.roles
             for number, stage in enumerate(role.stages)
         ]
         self._stages = [
-            (period, [(number, run, mailbox) for _, _, _, number, run, mailbox in group])
-            for (_, period), group in groupby(sorted(stages, key=lambda stage: stage[:4]), key=lambda stage: stage[:2])
+            (period, first, [(number, run, mailbox) for *_, number, run, mailbox in group])
+            for (_, period, first), group in groupby(
+                sorted(stages, key=lambda stage: stage[:5]), key=lambda stage: stage[:3]
+            )
         ]
-        self._tick_ns = gcd(*[period for period, _ in self._stages])
+        self._tick_ns = gcd(*[period for period, _, _ in self._stages])
+        self._first_ns = min(first for _, first, _ in self._stages)
 
     def instants(self) -> Iterator[int]:
-        """Runs the whole plan, from 0 to its duration inclusive; yields each instant [ns] when it is done."""
+        """Runs the whole plan, from 0 (or from when drives are brought up) to its duration inclusive; yields each instant
+        [ns] when it is done."""
         receivers, sink, stages = self._receivers, self._sink, self._stages
-        for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
-            for period, group in stages:
-                if time_ns % period:
+        for time_ns in range(self._first_ns, self.plan.duration_ns + 1, self._tick_ns):
+            for period, first_ns, group in stages:
+                if time_ns % period or time_ns < first_ns:
                     continue
                 for number, run, mailbox in group:
                     for message in run(time_ns, mailbox.take(number, time_ns)):

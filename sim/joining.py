@@ -23,7 +23,7 @@ class ProcessSpec:
 
     run: str
     kind: str
-    """`robot`, `leader`, `coordinator`, `recorder` or `bridge`"""
+    """`robot`, `leader`, `coordinator`, `recorder`, `bridge` or `drives`"""
     name: str
     index: int
     plan: Plan
@@ -33,8 +33,11 @@ class ProcessSpec:
     peers: tuple[tuple[str, str], ...]
     """(kind, name) of the processes whose tokens it waits for"""
     watched: bool = True
+    member: bool = True
+    """It is done when the run is; otherwise it is told when to finish"""
     folder: str = ""
-    can_url: str = ""
+    can_urls: tuple[str, ...] = ()
+    """One per bus of the plan; none: no bus"""
     scenario_toml: str = ""
     metadata: dict[str, str] = field(default_factory=dict)
 

@@ -1,8 +1,11 @@
 """Puts the messages of many sources into one order of time, whatever the order in which their batches come."""
 
 from collections.abc import Iterable
+from typing import Final
 
 from echelon.messages import Message
+
+_BEFORE_ALL_NS: Final = -(1 << 62)
 
 
 class TimeOrder:
@@ -12,9 +15,9 @@ class TimeOrder:
     """
 
     def __init__(self, sources: Iterable[int]) -> None:
-        self._latest = dict.fromkeys(sources, -1)
+        self._latest = dict.fromkeys(sources, _BEFORE_ALL_NS)
         self._waiting: dict[int, list[Message]] = {}
-        self._released_ns = -1
+        self._released_ns = _BEFORE_ALL_NS
         self.pushed = 0
         """Messages taken."""
         self.refused = 0

@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -22,6 +23,8 @@ from sim.joining import ProcessSpec, Result, StartError, meet, resources
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
+Body = Callable[[ProcessSpec, Session, Connection], None]
+"""What a process does once it has its session."""
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
@@ -34,11 +37,12 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     os.dup2(words.fileno(), 1)
     os.dup2(words.fileno(), 2)
     words.close()
+    body: Body
     try:
         if spec.kind == "recorder":
             from sim.watchers import run_recorder as body
-        elif spec.kind == "bridge":
-            from sim.watchers import run_bridge as body
+        elif spec.kind in ("bridge", "drives"):
+            body = _station_body(spec)
         else:
             body = _run_member
         with _open(spec) as session:
@@ -57,10 +61,28 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
 def _open(spec: ProcessSpec) -> Session:
     try:
         return Session(
-            listen=spec.listen, connect=spec.connect, lockstep=spec.virtual, own_receiver=spec.kind == "bridge"
+            listen=spec.listen,
+            connect=spec.connect,
+            lockstep=spec.virtual,
+            own_receiver=spec.kind == "bridge" and not spec.member,
         )
     except ValueError as error:
         raise StartError(str(error)) from None
+
+
+def _station_body(spec: ProcessSpec) -> Body:
+    """Returns what a process between robots and wheels does; each way needs modules of its own."""
+    if not spec.plan.stations:
+        from sim.watchers import run_bridge
+
+        return run_bridge
+    if spec.virtual:
+        from sim.stations import run_station
+
+        return run_station
+    from sim.wall_stations import run_wall_bridge, run_wall_drives
+
+    return run_wall_bridge if spec.kind == "bridge" else run_wall_drives
 
 
 def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:

@@ -6,6 +6,7 @@ Every time in the file is the run's own, so the same run gives the same bytes.
 from pathlib import Path
 from typing import Final
 
+from bridge.frame_message import TimedFrame
 from echelon.link import LinkCounts
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
@@ -16,6 +17,7 @@ from sim.scene import DESIRED, Scene, desired
 SCENARIO: Final = "scenario.toml"
 """The name of the attachment that holds the effective scenario."""
 FRAMES, LINKS = "/can/frames", "/links"
+"""Frames of the only bus; of several, the name of each stands between: `/can/can1/frames`."""
 
 
 class Recorder:
@@ -30,7 +32,9 @@ class Recorder:
         self._scene = Scene(plan)
         topics, routes = _routes(plan)
         topics |= self._scene.topics | {DESIRED: "visualization_msgs/MarkerArray"}
-        topics |= {FRAMES: "can_msgs/Frame", LINKS: "echelon_msgs/LinkStatistics"}
+        self._frame_topics = frame_topics(plan)
+        topics |= dict.fromkeys(self._frame_topics, "can_msgs/Frame")
+        topics |= {LINKS: "echelon_msgs/LinkStatistics"}
         self._numbers = {topic: number for number, topic in enumerate(topics, 1)}
         self._routes = {
             key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in routes.items()
@@ -40,7 +44,8 @@ class Recorder:
         self._now = -1
         self._head = b""
         self._next_display = self._shown = 0
-        self._frames = self._link_messages = 0
+        self._link_messages = 0
+        self._frames = [0] * len(self._frame_topics)
 
     @property
     def failure(self) -> str | None:
@@ -60,22 +65,23 @@ class Recorder:
         source, channel = message.source, message.channel
         number, size, encode = self._routes[16 * source + channel]
         if len(raw) != size:
-            name = self._plan.members[source].name
+            name = self._plan.everyone[source].name
             raise ValueError(f"{channel.name} of {name} has {len(raw) // 8} values; it must have {size // 8}")
         self._file.add(number, message.sequence, self._now, encode(self._head, raw))
         if channel is Channel.STATE:
             self._scene.states[source] = message.values
 
-    def record_frame(self, time_ns: int, can_id: int, data: bytes) -> None:
-        """Takes a CAN frame; an identifier above 0x7FF is an extended one.  Raises ValueError if it is not classic."""
-        if self._file.failure is None:
-            frame = ros.can_frame(ros.stamp(time_ns), can_id, data, can_id > 0x7FF)
-            self._file.add(self._numbers[FRAMES], self._frames, time_ns, frame)
-            self._frames += 1
+    def record_frame(self, timed: TimedFrame) -> None:
+        """Takes a CAN frame; what came before run time 0, when drives were brought up, is in can.log alone."""
+        time_ns, bus, _, (can_id, data, remote) = timed
+        if self._file.failure is None and time_ns >= 0 and bus < len(self._frames):
+            frame = ros.can_frame(ros.stamp(time_ns), can_id, data, remote)
+            self._file.add(self._numbers[self._frame_topics[bus]], self._frames[bus], time_ns, frame)
+            self._frames[bus] += 1
 
     def record_links(self, time_ns: int, links: list[LinkCounts]) -> None:
         """Takes the counts of links at an instant."""
-        members = self._plan.members
+        members = self._plan.everyone
         for counts in links if self._file.failure is None else ():
             name = f"{members[counts.source].name} to {members[counts.receiver].name}"
             data = ros.link_statistics(time_ns, counts, name)
@@ -118,6 +124,11 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
         topics[topic] = f"echelon_msgs/{kind}"
         routes[16 * source + channel] = (topic, splice)
 
+    if plan.stations:
+        for robot in plan.robots:
+            add(Channel.TORQUE, robot.index, f"/{robot.path}/torque", "WheelTorque", ros.wheel_torque())
+        bridge = plan.stations[0]
+        add(Channel.WHEELS, bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
     coupled, avoiding = plan.coupled, plan.avoidance.enabled
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
@@ -134,6 +145,13 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
         if any(child < len(plan.robots) for child in node.children):
             add(Channel.COMMAND, node.index, prefix + "command", "Command", ros.command(children))
     return topics, routes
+
+
+def frame_topics(plan: Plan) -> list[str]:
+    """Returns the topics of the frames, bus by bus."""
+    if len(plan.can.buses) == 1:
+        return [FRAMES]
+    return [f"/can/{bus.name}/frames" for bus in plan.can.buses]
 
 
 def state_topic(path: str) -> str:

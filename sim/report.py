@@ -269,7 +269,7 @@ def _bus_load(one: _Shown) -> list[str]:
     can, simulated = one.run.summary["can"], one.run.summary["simulated"]
     mean, peak = can.get("load_mean"), can.get("load_peak")
     if mean is None and can.get("bits") and simulated:
-        mean = can["bits"] / (simulated * one.run.trace.plan.can.bitrate)
+        mean = can["bits"] / (simulated * one.run.trace.plan.can.buses[0].bitrate)
     if mean is None:
         return []
     most = f", at most {100 * peak:.3g} %" if peak is not None else ""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.link import LinkCounts
-from echelon.messages import GROUP_FIELDS, STATE_FIELDS
+from echelon.messages import GROUP_FIELDS, STATE_FIELDS, TORQUE_FIELDS
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,8 @@ DEFINITIONS: Final = {
     + "float64[] error_rates\nfloat64[] positions\n",
     "echelon_msgs/Reference": _HEADER + "float64[] accelerations\nfloat64[] error_rates\nfloat64[] forces\n",
     "echelon_msgs/Command": _HEADER + "float64[] accelerations\n",
+    "echelon_msgs/WheelTorque": _HEADER + "".join(f"float64 {name}\n" for name in TORQUE_FIELDS),
+    "echelon_msgs/Wheels": _HEADER + "float64[] torques\n",
     "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
     "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
     "float64 age_mean_ns\nint64 age_max_ns\n",
@@ -204,6 +206,16 @@ def command(accelerations: int) -> Splice:
     return Splice(Layout().header(WORLD).holes(accelerations))
 
 
+def wheel_torque() -> Splice:
+    """Returns the encoder of echelon_msgs/WheelTorque; its values are `TORQUE_FIELDS`."""
+    return Splice(Layout().header("").hole(len(TORQUE_FIELDS)))
+
+
+def wheels(torques: int) -> Splice:
+    """Returns the encoder of echelon_msgs/Wheels."""
+    return Splice(Layout().header("").holes(torques))
+
+
 def transforms(frames: Sequence[str]) -> Template:
     """Returns the encoder of tf2_msgs/TFMessage from the world to robots; values per robot: x, y, q_z, q_w."""
     layout = Layout().put("I", len(frames))
@@ -258,11 +270,13 @@ def add_marker(
 _FRAME: Final = struct.Struct("<I4xIBBBB8s")  # an empty frame_id, up to the next multiple of four; then the CAN frame
 
 
-def can_frame(head: bytes, can_id: int, data: bytes, extended: bool) -> bytes:
-    """Returns a can_msgs/Frame; `head` is from `stamp`.  Raises ValueError if `data` is longer than eight bytes."""
+def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> bytes:
+    """Returns a can_msgs/Frame, an extended one if the identifier needs it; `head` is from `stamp`.
+
+    Raises ValueError if `data` is longer than eight bytes."""
     if len(data) > 8:
         raise ValueError(f"CAN frame {can_id:#x} holds {len(data)} bytes; can_msgs/Frame takes at most 8")
-    return head + _FRAME.pack(1, can_id, False, extended, False, len(data), data)
+    return head + _FRAME.pack(1, can_id, remote, can_id > 0x7FF, False, len(data), data)
 
 
 def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from echelon.load import effective_toml
+from echelon.messages import Channel
 from echelon.plan import Plan
 from echelon.scenario import Scenario
 from sim.engine import Engine
@@ -26,7 +27,7 @@ from sim.watchers import Recording
 
 PARTS: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
-FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html")
+FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
 
 
@@ -52,7 +53,8 @@ def new_folder(scenario: Scenario, out: Path | None) -> Path:
             count += 1
     out.mkdir(parents=True, exist_ok=True)
     for name in FILES:
-        (out / name).unlink(missing_ok=True)
+        for path in out.glob(name):
+            path.unlink()
     return out
 
 
@@ -63,7 +65,7 @@ def execute(
     *,
     engine: str,
     clock: str,
-    can_url: str,
+    can_urls: tuple[str, ...],
     display: Display,
     stall_timeout_s: float = 30.0,
 ) -> Finished:
@@ -79,14 +81,14 @@ def execute(
         "python": platform.python_version(),
     } | {part: version(part) for part in PARTS}
     if engine == "inprocess":
-        outcome = _in_process(plan, folder, clock, can_url, toml, metadata, display)
+        outcome = _in_process(plan, folder, clock, can_urls, toml, metadata, display)
     else:
         outcome = Supervisor(
             plan,
             folder,
             run=blake2b(f"{folder.resolve()} {time.time_ns()}".encode(), digest_size=8).hexdigest(),
             virtual=clock == "virtual",
-            can_url=can_url,
+            can_urls=can_urls,
             scenario_toml=toml,
             metadata=metadata,
             show=display.show,
@@ -106,21 +108,28 @@ def _in_process(
     plan: Plan,
     folder: Path,
     clock: str,
-    can_url: str,
+    can_urls: tuple[str, ...],
     toml: str,
     metadata: dict[str, str],
     display: Display,
 ) -> Outcome:
     """The in-process engine with recorder and bridge beside it, in the same order of messages as between processes."""
     recording = Recording(folder, plan, toml, metadata)
-    station: Any = None
-    if can_url:
-        from bridge.station import Station
-
-        station = Station(plan, can_url, folder)
-    order = TimeOrder(range(len(plan.members) + (station is not None)))
     gathered: list[Any] = []
     engine = Engine(plan, gathered.append)
+    station: Any = None
+    if plan.stations:
+        from bridge.closed import ClosedStation
+        from bridge.commander import Commander
+
+        commander = engine.roles[plan.stations[0].index]
+        assert isinstance(commander, Commander)
+        station = ClosedStation(plan, can_urls, folder, paired=False, role=commander)
+    elif can_urls:
+        from bridge.station import Station
+
+        station = Station(plan, can_urls, folder)
+    order = TimeOrder(range(len(plan.everyone) if plan.stations else len(plan.members) + bool(can_urls)))
     progress = Progress(phase="running", started_s=time.monotonic())
     if station is not None:
         progress.can["url"] = station.url
@@ -128,7 +137,11 @@ def _in_process(
     failure: str | None = None
 
     def pass_on() -> None:
-        if station is not None:
+        if plan.stations:
+            for message in gathered:
+                if message.channel is Channel.FRAMES and message.source == station.index:
+                    station.note(message)
+        elif station is not None:
             gathered.extend(station.put(gathered))  # robots speak in their order, instant by instant
         recording.add(order.push(gathered))
         gathered.clear()
@@ -165,12 +178,25 @@ def _in_process(
         trace=result["trace"],
         links=links,
         results=[],
-        can=station.result() if station is not None else {},
+        can=_can_result(engine, station),
         startup_s=0.0,
         wall_s=wall_s,
         messages=result["messages"],
         failure=failure,
     )
+
+
+def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
+    if station is None:
+        return {}
+    result: dict[str, Any] = station.result()
+    if engine.plan.stations[1:]:
+        from bridge.drive_bank import DriveBank
+
+        drives = engine.roles[engine.plan.stations[1].index]
+        assert isinstance(drives, DriveBank)
+        result["drives"] = {"robots": drives.summary()}
+    return result
 
 
 def _note(progress: Progress, recording: Any, station: Any) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from echelon.link import LinkCounts
 from echelon.plan import Plan
 from sim.blocks import block_series
+from sim.can_lines import can_lines, can_reasons
 from sim.distances import Distances, distances
 from sim.measures import block_row, claim_rows, distance_row, link_row, separation_rows, torque_row
 from sim.trace import Trace
@@ -34,7 +35,7 @@ def summarise(
     near = distances(trace)
     end_ns = int(blocks.times_ns[-1]) if len(blocks.times_ns) else None
     claims = claim_rows(plan, blocks)
-    reasons = [*_broken(trace, end_ns), *_failed(claims), *_too_close(plan, near)]
+    reasons = [*_broken(trace, end_ns), *_failed(claims), *_too_close(plan, near), *can_reasons(can)]
     summary = {
         "format": FORMAT,
         "scenario": plan.name,
@@ -95,8 +96,7 @@ def _lines(summary: Mapping[str, Any]) -> Iterator[str]:
     sent, lost = (sum(link[key] for link in summary["links"]) for key in ("sent", "lost"))
     age = max((link["age_max"] for link in summary["links"]), default=0.0)
     yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
-    if (can := summary["can"]).get("fit"):
-        yield f"  CAN      {can['frames']} frames, {can['clipped']} clipped; {can['fit']}"
+    yield from can_lines(summary["can"])
     run = summary["run"]
     if run.get("clock") == "wall" and run.get("stages"):
         yield f"  late     {run['late_stages']} of {run['stages']} stages, at most {number(run['latest'], 's')}"

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from echelon.link import LinkCounts
 from echelon.plan import Plan
-from sim.children import WATCHERS, Child, list_specs, start
+from sim.children import FINISHING, Child, list_specs, start
 from sim.joining import ProcessSpec, Result
 from sim.trace import Trace, TraceBuilder
 
@@ -73,7 +73,7 @@ class Supervisor:
         *,
         run: str,
         virtual: bool,
-        can_url: str = "",
+        can_urls: tuple[str, ...] = (),
         scenario_toml: str = "",
         metadata: dict[str, str] | None = None,
         recorded: bool = True,
@@ -85,7 +85,7 @@ class Supervisor:
         self.progress = Progress()
         self._show = show
         self._stall_timeout_s = stall_timeout_s
-        self._specs = order(list_specs(plan, run, virtual, folder, can_url, scenario_toml, metadata or {}, recorded))
+        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, scenario_toml, metadata or {}, recorded))
         self._children: list[Child] = []
         self._moved_s = 0.0
         self._moved_at = (-1, -1)
@@ -244,7 +244,7 @@ class Supervisor:
             return "everyone waits for " + ", ".join(
                 f"{child.name} (process {child.process.pid}, {child.state()})" for child in silent
             )
-        members = self.plan.members
+        members = self.plan.everyone
         waits = [
             f"{child.name} for {', '.join(members[source].name for source in child.waiting_for)}"
             for child in self._children
@@ -265,15 +265,21 @@ class Supervisor:
                 child.process.kill()
 
     def _finish_watchers(self, failure: str | None) -> str | None:
-        """Lets the bridge, then the recorder, finish their files; returns the failure, if there is one by now."""
+        """Lets bridge, drives and recorder finish, in this order; returns the failure, if there is one by now."""
         links = [counts for child in self._children if child.result for counts in child.result.links]
-        sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0}
+        sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
         for child in self._children:
             if child.result and child.result.runner:
                 sent[child.spec.kind] += child.result.runner.messages
-        for kind in WATCHERS:
+        for kind in FINISHING:
             for child in self._children:
-                if child.spec.kind != kind or not child.ready or child.control.closed or not child.process.is_alive():
+                if (
+                    child.spec.kind != kind
+                    or child.is_member
+                    or not child.ready
+                    or child.control.closed
+                    or not child.process.is_alive()
+                ):
                     continue
                 whole = failure is None and self.virtual  # on a wall clock, messages may be lost on the way
                 order = {
@@ -293,7 +299,7 @@ class Supervisor:
                 except (RunError, OSError) as error:
                     failure = failure or str(error)
                 if child.result is not None and kind == "bridge":
-                    sent["bridge"] = child.result.extra["messages"]
+                    sent["bridge"] = child.result.extra.get("messages", 0)
                 if child.result is None:
                     failure = failure or f"lost {kind} ({child.ending()}){self._words_of([child.name])}"
         for child in self._children:
@@ -332,7 +338,7 @@ class Supervisor:
             trace=recorded.get("trace") or TraceBuilder(self.plan).build(),
             links=[counts for result in results for counts in result.links],
             results=results,
-            can=extra.get("bridge", {}),
+            can=extra.get("bridge", {}) | ({"drives": extra["drives"]} if "drives" in extra else {}),
             startup_s=startup_s,
             wall_s=wall_s,
             messages=recorded.get("messages", 0),

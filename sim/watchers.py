@@ -10,8 +10,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
+from bridge.frame_message import unpack
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.session import Inbox, Session
@@ -73,7 +72,9 @@ class Reception:
 def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
     plan = spec.plan
-    sources = range(len(plan.members) + bool(spec.can_url))  # the bridge's messages come after the members'
+    sources = range(
+        len(plan.everyone) if plan.stations else len(plan.members) + bool(spec.can_urls)
+    )  # the bridge's messages come after the members'
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources)
     try:
         recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
@@ -108,6 +109,7 @@ class Recording:
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self._time_ns = 0
+        self._bridge = len(plan.members)
 
     def add(self, messages: list[Message]) -> None:
         """Takes messages in order of time."""
@@ -115,8 +117,9 @@ class Recording:
         for message in messages:
             self.messages += 1
             if message.channel is Channel.FRAMES:
-                for identifier, data in frames_of(message):
-                    recorder.record_frame(message.time_ns, identifier, data)
+                if message.source == self._bridge:  # which tells of the drives' frames, too
+                    for timed in unpack(message.values):
+                        recorder.record_frame(timed)
             else:
                 trace.add(message)
                 recorder.record(message)
@@ -153,7 +156,7 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
     reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots)
     publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
     try:
-        station = Station(plan, spec.can_url, Path(spec.folder))
+        station = Station(plan, spec.can_urls, Path(spec.folder))
     except (ValueError, OSError) as error:
         raise StartError(str(error)) from None
     control.send(("bus", station.url))
@@ -181,10 +184,3 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, extra=station.result())))
     control.recv()
-
-
-def frames_of(message: Message) -> Iterator[tuple[int, bytes]]:
-    """Yields identifier and data of the frames in a message of channel FRAMES."""
-    words = np.ascontiguousarray(message.values).view("<u8")
-    for identifier, data in words.reshape(-1, 2).tolist():
-        yield identifier, data.to_bytes(8, "little")

@@ -19,6 +19,10 @@ def make() -> Bridge:
     return Bridge(["g1/r1", "g1/r2"], 0.001, 10 * MS)
 
 
+def said(robot: int, right: float, left: float, enable: bool, counter: int) -> Torque:
+    return Torque(robot, right, left, enable, enable, False, False, False, False, counter)
+
+
 def decode(frames: list[tuple[int, bytes]]) -> Torque:
     ((can_id, data),) = frames
     frame = CODEC.decode(can_id, data)
@@ -28,9 +32,9 @@ def decode(frames: list[tuple[int, bytes]]) -> Torque:
 
 def test_one_frame_per_robot_and_period_in_order() -> None:
     bridge = make()
-    frames = [bridge.encode(step * 10 * MS, robot, 1.0 + robot, -0.5, False) for step in range(20) for robot in (0, 1)]
+    frames = [bridge.encode(step * 10 * MS, robot, 1.0 + robot, -0.5) for step in range(20) for robot in (0, 1)]
     assert [decode(one) for one in frames] == [
-        Torque(robot, 1.0 + robot, -0.5, True, False, False, step % 16) for step in range(20) for robot in (0, 1)
+        said(robot, 1.0 + robot, -0.5, True, step % 16) for step in range(20) for robot in (0, 1)
     ]
     assert bridge.frames == 40
     assert bridge.bits == sum(frame_bits(can_id, data) for ((can_id, data),) in frames)
@@ -41,18 +45,18 @@ def test_one_frame_per_robot_and_period_in_order() -> None:
 def test_torque_that_is_not_finite_stops_the_drives(torques: tuple[float, float]) -> None:
     bridge = make()
     bridge.encode(0, 1, 5.0, 5.0)
-    assert decode(bridge.encode(10 * MS, 1, *torques)) == Torque(1, 0.0, 0.0, False, False, False, 1)
+    assert decode(bridge.encode(10 * MS, 1, *torques)) == said(1, 0.0, 0.0, False, 1)
     assert bridge.counts[1].stopped == {Stop.NOT_FINITE: 1}
     assert (bridge.counts[1].smallest, bridge.counts[1].largest) == ((5.0, 5.0), (5.0, 5.0))
-    assert decode(bridge.encode(20 * MS, 1, 2.0, 2.0)) == Torque(1, 2.0, 2.0, True, False, False, 2)
+    assert decode(bridge.encode(20 * MS, 1, 2.0, 2.0)) == said(1, 2.0, 2.0, True, 2)
 
 
 def test_old_torque_stops_the_drives_and_a_repeated_one_gives_nothing() -> None:
     bridge = make()
     bridge.encode(20 * MS, 0, 1.0, 1.0)
-    assert decode(bridge.encode(10 * MS, 0, 1.0, 1.0)) == Torque(0, 0.0, 0.0, False, False, False, 1)
+    assert decode(bridge.encode(10 * MS, 0, 1.0, 1.0)) == said(0, 0.0, 0.0, False, 1)
     assert bridge.encode(20 * MS, 0, 1.0, 1.0) == []
-    assert decode(bridge.encode(10 * MS, 1, 1.0, 1.0)).enable  # each robot has its own time
+    assert decode(bridge.encode(10 * MS, 1, 1.0, 1.0)).enable_right  # each robot has its own time
     counts = bridge.counts[0]
     assert (counts.frames, counts.stopped, counts.repeated) == (2, {Stop.STALE: 1}, 1)
 
@@ -66,8 +70,8 @@ def test_periods_without_torque_are_counted() -> None:
 
 def test_stop_on_request() -> None:
     bridge = make()
-    assert not decode(bridge.stop(1)).enable
-    assert not decode(bridge.stop(1, Stop.MISSING)).enable
+    assert not decode(bridge.stop(1)).enable_right
+    assert not decode(bridge.stop(1, Stop.MISSING)).enable_right
     assert bridge.counts[1].stopped == {Stop.REQUESTED: 1, Stop.MISSING: 1}
 
 
@@ -105,8 +109,9 @@ def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> Non
             assert isinstance(frame, Torque)
             assert frame.robot == robot
             assert checks[robot].step(frame.counter) == 0
-            assert frame.enable or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
-            assert not frame.enable or (math.isfinite(right) and math.isfinite(left))
+            assert frame.enable_right == frame.enable_left
+            assert frame.enable_right or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
+            assert not frame.enable_right or (math.isfinite(right) and math.isfinite(left))
             total += 1
     assert total == bridge.frames == sum(counts.frames for counts in bridge.counts)
     assert total + sum(counts.repeated for counts in bridge.counts) == len(calls)

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from bridge.bus_load import bus_load, explain, frame_bits, many_frame_bits, worst_case_bits
 
 
-def by_hand(can_id: int, data: bytes) -> int:
+def by_hand(can_id: int, data: bytes, remote: bool = False) -> int:
     """The same from a string of bits: CRC by long division, stuffing by replacing."""
-    bits = f"0{can_id:011b}000{len(data):04b}" + "".join(f"{byte:08b}" for byte in data)
+    bits = f"0{can_id:011b}{remote:b}00{len(data):04b}" + "".join(f"{byte:08b}" for byte in data)
     remainder = int(bits, 2) << 15
     divisor = 0b1100010110011001  # the CRC-15 polynomial of CAN
     while remainder.bit_length() > 15:
@@ -35,6 +35,13 @@ def test_length_of_extreme_frames(can_id: int, data: bytes) -> None:
     assert frame_bits(can_id, data) == by_hand(can_id, data)
 
 
+@given(st.integers(0, 0x7FF))
+def test_length_of_any_remote_frame(can_id: int) -> None:
+    bits = frame_bits(can_id, b"", remote=True)
+    assert bits == by_hand(can_id, b"", remote=True)
+    assert 47 <= bits <= worst_case_bits(0)
+
+
 def test_published_numbers() -> None:
     # Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007: (55 + 10 n) bit times
     assert [worst_case_bits(n) for n in range(9)] == [55 + 10 * n for n in range(9)]
@@ -55,6 +62,8 @@ def test_refused() -> None:
         frame_bits(0x800, b"")
     with pytest.raises(ValueError, match="not 9"):
         frame_bits(1, bytes(9))
+    with pytest.raises(ValueError, match="no data, not 2"):
+        frame_bits(1, bytes(2), remote=True)
     with pytest.raises(ValueError, match="not -1"):
         worst_case_bits(-1)
     with pytest.raises(ValueError, match="bit rate"):

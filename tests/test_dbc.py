@@ -10,7 +10,9 @@ import pytest
 from cantools.database.can import Database
 
 from bridge.dbc import identifiers, torque_dbc
-from bridge.native.codec import NativeCodec, frame_id
+from bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status, frame_id
+from bridge.native.dbc import messages
+from tests.bench_drives import drive_plan
 
 ROBOTS = ["g1/r1", "g1/r2", "g2/r1"]
 
@@ -23,9 +25,13 @@ def load(text: str) -> Database:
 
 def test_fields_units_and_ranges() -> None:
     database = load(torque_dbc(ROBOTS, 0.001, 10_000_000))
-    assert [message.name for message in database.messages] == ["torque_g1_r1", "torque_g1_r2", "torque_g2_r1"]
-    assert [message.frame_id for message in database.messages] == [frame_id(robot) for robot in range(3)]
-    message = database.messages[2]
+    names = {message.frame_id: message.name for message in database.messages}
+    kinds = {0x100: "torque", 0x180: "feedback", 0x200: "status"}
+    robots = ("g1_r1", "g1_r2", "g2_r1")
+    assert names == {base + at: f"{kind}_{name}" for base, kind in kinds.items() for at, name in enumerate(robots)}
+    assert [database.get_message_by_frame_id(base + 1).cycle_time for base in kinds] == [10, 10, 100]
+    assert database.get_message_by_frame_id(0x182).senders == ["drive_g2_r1"]
+    message = database.get_message_by_frame_id(frame_id(2))
     assert (message.length, message.cycle_time, message.senders) == (8, 10, ["bridge"])
     assert message.comment is not None
     assert "g2/r1" in message.comment
@@ -44,7 +50,44 @@ def test_decodes_what_the_codec_encodes(scale: float) -> None:
     assert isinstance(values, dict)
     assert values.pop("tau_right") == pytest.approx(123 * scale, rel=1e-12)
     assert values.pop("tau_left") == pytest.approx(-456 * scale, rel=1e-12)
-    assert values == {"enable": 1, "clipped": 0, "saturated": 1, "counter": 9, "crc": data[7]}
+    flags = {"enable_right": 1, "enable_left": 1, "clear": 0, "clipped": 0, "saturated": 1, "estop": 0}
+    assert values == flags | {"counter": 9, "crc": data[7]}
+
+
+def test_decodes_what_drives_say() -> None:
+    database = load(torque_dbc(ROBOTS, 0.01))
+    states, faults = (WheelState.ENABLED, WheelState.FAULT), (FaultCode.NONE, FaultCode.BROWN_OUT)
+    data = NativeCodec(0.01).encode_feedback(Feedback(2, (0.25, -1.5), states, faults, 7))
+    values = database.decode_message(0x182, data)
+    assert isinstance(values, dict)
+    assert {name: value if isinstance(value, float) else str(value) for name, value in values.items()} == {
+        "mean_tau_right": pytest.approx(0.25),
+        "mean_tau_left": pytest.approx(-1.5),
+        "state_right": "enabled",
+        "state_left": "fault",
+        "fault_right": "none",
+        "fault_left": "brown_out",
+        "counter": "7",
+        "crc": str(data[7]),
+    }
+    data = encode_status(Status(0, (1.25, -300.0), 23.5, -5.0, 3))
+    assert database.decode_message(0x200, data) == {
+        "speed_right": pytest.approx(1.25),
+        "speed_left": pytest.approx(-300.0),
+        "supply": 23.5,
+        "temperature": -5,
+        "counter": 3,
+        "crc": data[7],
+    }
+
+
+def test_messages_of_a_plan_are_the_same() -> None:
+    database = load(torque_dbc(ROBOTS, 0.001, 10_000_000))
+    for message in messages(drive_plan("native"), "g1_r2", 1):
+        other = database.get_message_by_name(message.name)
+        assert (message.frame_id, message.cycle_time) == (other.frame_id, other.cycle_time)
+        fields = [(signal.name, signal.start, signal.length, signal.scale) for signal in message.signals]
+        assert fields == [(signal.name, signal.start, signal.length, signal.scale) for signal in other.signals]
 
 
 def test_names_are_valid_short_and_unique() -> None:
@@ -52,8 +95,8 @@ def test_names_are_valid_short_and_unique() -> None:
     names = identifiers(paths)
     assert names[:3] == ["g1_r1", "g1_r1_2", "g1_r1_3"]
     assert len(set(names)) == len(paths)
-    assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,31}", f"torque_{name}") for name in names)
-    assert len(load(torque_dbc(paths, 0.001)).messages) == len(paths)
+    assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,31}", f"feedback_{name}") for name in names)
+    assert len({message.name for message in load(torque_dbc(paths, 0.001)).messages}) == 3 * len(paths)
 
 
 def test_refused() -> None:
@@ -72,4 +115,4 @@ def test_cantools_decode_shows_newton_metres(tmp_path: Path) -> None:
     for line in (f"(1700000000.010000) vcan0 102#{data.hex().upper()}", f"  vcan0  102   [8]  {data.hex(' ').upper()}"):
         run = subprocess.run(command, input=line + "\n", capture_output=True, text=True, check=True, timeout=60)
         assert run.stdout.startswith(line)
-        assert "torque_g2_r1(tau_right: 1.25 Nm, tau_left: -0.75 Nm, enable: 1," in run.stdout
+        assert "torque_g2_r1(tau_right: 1.25 Nm, tau_left: -0.75 Nm, enable_right: 1, enable_left: 1," in run.stdout

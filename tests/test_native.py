@@ -1,37 +1,81 @@
 """The native torque frame: bytes, limits, and what is refused."""
 
 import math
-from dataclasses import replace
+import struct
 
 import pytest
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.native.codec import LENGTH, MAX_ROBOTS, RAW_MAX, CounterCheck, NativeCodec, Refusal, Torque, crc8, frame_id
+from bridge.native.codec import (
+    LENGTH,
+    MAX_ROBOTS,
+    RAW_MAX,
+    CounterCheck,
+    FaultCode,
+    Feedback,
+    NativeCodec,
+    Refusal,
+    Status,
+    Torque,
+    WheelState,
+    crc8,
+    decode_status,
+    encode_status,
+    frame_id,
+)
 
 MILLI = NativeCodec(0.001)
 
-# (codec, frame, identifier, bytes): encoded to the bytes, decoded to the frame
+
+def torque(robot: int, right: float, left: float, counter: int, **flags: bool) -> Torque:
+    """A command that enables both wheels and says nothing else, but for `flags`."""
+    plain = Torque(robot, right, left, True, True, False, False, False, False, counter)
+    return plain._replace(**flags)  # type: ignore[arg-type]
+
+
+def with_crc(can_id: int, body: bytes) -> bytes:
+    return body + bytes([Crc8SaeJ1850.calc(can_id.to_bytes(2, "little") + body)])
+
+
+# (codec, frame, identifier, bytes without CRC): encoded to the bytes, decoded to the frame
 GOLDEN = [
-    (MILLI, Torque(3, 1.0, -1.5, True, False, False, 7), 0x103, "e80324fa010700f3"),
-    (MILLI, Torque(0, 0.0, 0.0, False, False, False, 0), 0x100, "0000000000000023"),
-    (MILLI, Torque(126, 32.767, -32.767, True, False, True, 15), 0x17E, "ff7f0180050f001c"),
-    (NativeCodec(4.0), Torque(8, 1e5, -4.0, True, False, False, 1), 0x108, "a861ffff01010084"),
+    (MILLI, torque(3, 1.0, -1.5, 7), 0x103, "e80324fa030700"),
+    (MILLI, torque(0, 0.0, 0.0, 0, enable_right=False, enable_left=False), 0x100, "00000000000000"),
+    (MILLI, torque(126, 32.767, -32.767, 15, saturated=True), 0x17E, "ff7f0180130f00"),
+    (NativeCodec(4.0), torque(8, 1e5, -4.0, 1), 0x108, "a861ffff030100"),
+    (MILLI, torque(7, 0.0, 0.5, 4, enable_right=False), 0x107, "0000f401020400"),
+    (MILLI, torque(7, 0.5, 0.0, 4, enable_left=False), 0x107, "f4010000010400"),
+    (MILLI, torque(1, 0.0, 0.0, 9, enable_right=False, enable_left=False, clear=True), 0x101, "00000000040900"),
+    (MILLI, torque(1, 0.0, 0.0, 9, enable_right=False, enable_left=False, estop=True), 0x101, "00000000200900"),
 ]
 
 
 @pytest.mark.parametrize(("codec", "frame", "can_id", "text"), GOLDEN)
 def test_golden_bytes_both_ways(codec: NativeCodec, frame: Torque, can_id: int, text: str) -> None:
     data, clipped = codec.encode(
-        frame.robot, frame.tau_right, frame.tau_left, frame.counter, enable=frame.enable, saturated=frame.saturated
+        frame.robot,
+        frame.tau_right,
+        frame.tau_left,
+        frame.counter,
+        enable=(frame.enable_right, frame.enable_left),
+        saturated=frame.saturated,
+        clear=frame.clear,
+        estop=frame.estop,
     )
-    assert (frame_id(frame.robot), data.hex(), clipped) == (can_id, text, 0)
-    decoded = codec.decode(can_id, bytes.fromhex(text))
+    assert (frame_id(frame.robot), data, clipped) == (can_id, with_crc(can_id, bytes.fromhex(text)), 0)
+    decoded = codec.decode(can_id, data)
     assert isinstance(decoded, Torque)
-    assert replace(decoded, tau_right=frame.tau_right, tau_left=frame.tau_left) == frame
+    assert decoded._replace(tau_right=frame.tau_right, tau_left=frame.tau_left) == frame
     assert decoded.tau_right == pytest.approx(frame.tau_right, abs=1e-12)
     assert decoded.tau_left == pytest.approx(frame.tau_left, abs=1e-12)
+
+
+def test_golden_bytes_with_crc() -> None:
+    """As they are on the wire, worked out by hand once."""
+    data, _ = MILLI.encode(0, 0.0, 0.0, 0, enable=(False, False))
+    assert data.hex() == "0000000000000023"
 
 
 @given(st.binary(max_size=40))
@@ -60,7 +104,13 @@ def test_round_trip_is_within_half_a_bit(
     assert isinstance(frame, Torque)
     assert abs(frame.tau_right - right) <= scale * (0.5 + 1e-9)
     assert abs(frame.tau_left - left) <= scale * (0.5 + 1e-9)
-    assert (clipped, frame.clipped, frame.saturated, frame.enable) == (0, False, saturated, True)
+    assert (clipped, frame.clipped, frame.saturated, frame.enable_right, frame.enable_left) == (
+        0,
+        False,
+        saturated,
+        True,
+        True,
+    )
     assert (frame.robot, frame.counter) == (robot, counter % 16)
 
 
@@ -79,8 +129,8 @@ def test_what_does_not_fit_is_clipped_and_counted(torque: float, clipped: int) -
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("enable", [True, False])
-def test_torque_that_is_not_finite_is_refused(bad: float, enable: bool) -> None:
+@pytest.mark.parametrize("enable", [(True, True), (False, False)])
+def test_torque_that_is_not_finite_is_refused(bad: float, enable: tuple[bool, bool]) -> None:
     with pytest.raises(ValueError, match="finite"):
         MILLI.encode(0, bad, 0.0, 0, enable=enable)
     with pytest.raises(ValueError, match="finite"):
@@ -102,10 +152,6 @@ def test_bad_scale(scale: float) -> None:
         NativeCodec(scale)
 
 
-def with_crc(can_id: int, body: bytes) -> bytes:
-    return body + bytes([Crc8SaeJ1850.calc(can_id.to_bytes(2, "little") + body)])
-
-
 @given(robots, st.binary(min_size=7, max_size=7))
 def test_any_body_with_a_right_crc(robot: int, body: bytes) -> None:
     frame = MILLI.decode(0x100 + robot, with_crc(0x100 + robot, body))
@@ -114,7 +160,8 @@ def test_any_body_with_a_right_crc(robot: int, body: bytes) -> None:
         return
     assert isinstance(frame, Torque)
     assert abs(frame.tau_right) <= RAW_MAX * 0.001
-    assert frame.enable or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
+    assert frame.enable_right or frame.tau_right == 0.0
+    assert frame.enable_left or frame.tau_left == 0.0
 
 
 @pytest.mark.parametrize("body", ["00800000010000", "00000080010000"])
@@ -149,3 +196,85 @@ def test_counter_gaps() -> None:
     check = CounterCheck()
     assert [check.step(n) for n in (14, 15, 0, 3, 3, 4)] == [0, 0, 0, 2, -1, 0]
     assert (check.frames, check.missed, check.repeated) == (6, 2, 1)
+
+
+wheel_states = st.sampled_from(WheelState)
+fault_codes = st.sampled_from(FaultCode)
+
+
+@given(
+    scales,
+    robots,
+    st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)),
+    st.tuples(wheel_states, wheel_states),
+    st.tuples(fault_codes, fault_codes),
+    st.integers(0, 15),
+)
+def test_feedback_bytes_and_round_trip(
+    scale: float,
+    robot: int,
+    share: tuple[float, float],
+    states: tuple[WheelState, WheelState],
+    faults: tuple[FaultCode, FaultCode],
+    counter: int,
+) -> None:
+    codec = NativeCodec(scale)
+    torques = share[0] * codec.limit, share[1] * codec.limit
+    data = codec.encode_feedback(Feedback(robot, torques, states, faults, counter))
+    bits = [max(-RAW_MAX, min(RAW_MAX, round(part / scale))) for part in torques]
+    tail = bytes([states[0] + 16 * states[1], counter, faults[0] + 16 * faults[1]])
+    assert data == with_crc(0x180 + robot, struct.pack("<hh", *bits) + tail)
+    said = codec.decode_feedback(0x180 + robot, data)
+    assert said == Feedback(robot, (bits[0] * scale, bits[1] * scale), states, faults, counter)
+
+
+@given(robots, st.floats(-400, 400), st.floats(-400, 400), st.floats(-5, 140), st.floats(-80, 250))
+def test_status_bytes_and_round_trip(robot: int, right: float, left: float, voltage: float, temperature: float) -> None:
+    data = encode_status(Status(robot, (right, left), voltage, temperature, 29))
+    bits = [max(-RAW_MAX, min(RAW_MAX, round(speed / 0.01))) for speed in (right, left)]
+    volts, warm = max(0, min(255, round(voltage / 0.5))), max(0, min(255, round(temperature + 40)))
+    assert data == with_crc(0x200 + robot, struct.pack("<hhBBB", *bits, volts, 13, warm))
+    said = decode_status(0x200 + robot, data)
+    assert said == Status(robot, (bits[0] * 0.01, bits[1] * 0.01), volts / 2, warm - 40, 13)
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        ("00800000000000", Refusal.VALUE),
+        ("00000080000000", Refusal.VALUE),
+        ("00000000030000", Refusal.VALUE),  # states and faults that do not exist
+        ("00000000300000", Refusal.VALUE),
+        ("00000000000006", Refusal.VALUE),
+        ("00000000000060", Refusal.VALUE),
+        ("00000000120045", None),
+    ],
+)
+def test_feedback_that_says_nothing_known_is_refused(body: str, why: Refusal | None) -> None:
+    data = with_crc(0x183, bytes.fromhex(body))
+    said = MILLI.decode_feedback(0x183, data)
+    assert said is why or isinstance(said, Feedback) == (why is None)
+    assert MILLI.decode_feedback(0x184, data) is Refusal.CRC
+    assert MILLI.decode_feedback(0x183, data[:7]) is Refusal.LENGTH
+    assert MILLI.decode_feedback(0x103, data) is Refusal.ID
+    assert decode_status(0x183, data) is Refusal.ID
+
+
+def test_what_a_drive_cannot_say() -> None:
+    quiet, fine = (WheelState.DISABLED,) * 2, (FaultCode.NONE,) * 2
+    with pytest.raises(ValueError, match="finite"):
+        MILLI.encode_feedback(Feedback(0, (math.nan, 0.0), quiet, fine, 0))
+    with pytest.raises(ValueError, match="127"):
+        MILLI.encode_feedback(Feedback(127, (0.0, 0.0), quiet, fine, 0))
+    with pytest.raises(ValueError, match="finite"):
+        encode_status(Status(0, (0.0, 0.0), math.inf, 0.0, 0))
+    with pytest.raises(ValueError, match="finite"):
+        encode_status(Status(0, (0.0, math.nan), 0.0, 0.0, 0))
+
+
+def test_a_counter_that_begins_anew() -> None:
+    check = CounterCheck()
+    check.step(7)
+    check.forget()
+    assert check.step(7) == 0
+    assert check.repeated == 0

@@ -11,6 +11,7 @@ from trees import PAPER_TREE, Tree, plan_of, random_epsilon, scenario, trees, wi
 from agents.plant import state_at
 from agents.robot import Robot
 from controller.law import BlockGains, CentralLaw
+from echelon.layout import sized
 from echelon.messages import NULL, STATE_FIELDS, Channel, Message
 from echelon.plan import Array, AvoidancePlan, LinkPlan, Plan
 from sim.engine import Engine
@@ -25,7 +26,7 @@ def random_plan(tree: Tree, seed: int, time_scales: str, coupling: float, avoida
     random = np.random.default_rng(seed)
     law = random_epsilon(tree, random, time_scales) | {"lead": random.choice([0.0, 0.5])}
     plan = with_random_gains(plan_of(scenario(tree, random, law=law, **tables)), random, coupling)
-    return replace(plan, avoidance=NEAR) if avoidance else plan
+    return sized(replace(plan, avoidance=NEAR)) if avoidance else plan
 
 
 class Watched:
@@ -76,7 +77,7 @@ def test_nine_robots_that_avoid_each_other_do_feel_it():
     """The random trees above mean something only if their forces do."""
     plan = random_plan(PAPER_TREE, 5, "three", 0.5, avoidance=True)
     near = Watched(plan, 5).commanded(0)
-    far = Watched(replace(plan, avoidance=replace(NEAR, enabled=False)), 5).commanded(0)
+    far = Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 5).commanded(0)
     assert np.abs(near - far).max() > 1.0
 
 
@@ -149,7 +150,7 @@ def slow_root(ratio: int, coupling: float, avoidance: bool, ticks: int = 9) -> P
     table["formation"]["period"] = 0.001 * ratio
     table["law"] = {"epsilon": [0.5, 0.5], "lead": 0.5}
     plan = with_random_gains(plan_of(table), np.random.default_rng(3), coupling)
-    return replace(plan, avoidance=NEAR) if avoidance else plan
+    return sized(replace(plan, avoidance=NEAR)) if avoidance else plan
 
 
 @pytest.mark.parametrize("ratio", [2, 3])
@@ -186,7 +187,7 @@ def test_slow_coordinator_holds_what_it_said(ratio, coupling):
 def test_slow_coordinator_hands_down_forces_of_its_own_pairs_only():
     """Within a group robots avoid each other at T; between groups by the forces of the last k T."""
     plan = slow_root(3, 0.0, avoidance=True)
-    run, quiet = Watched(plan, 7), Watched(replace(plan, avoidance=replace(NEAR, enabled=False)), 7)
+    run, quiet = Watched(plan, 7), Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 7)
     np.testing.assert_array_equal(run.states(0), quiet.states(0))
     time_ns = 3_000_000
     states = run.states(time_ns)

@@ -23,6 +23,8 @@ from invented import METADATA, ROOT, invented, paper
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from bridge.frame import Frame
+from bridge.frame_message import TimedFrame
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS, Channel, Message
 from sim import chunked, recording
@@ -33,7 +35,7 @@ LINKS = [
     LinkCounts(0, 9, Channel.STATE, 21, 20, 1, 0, 20, 2, 1.5e6, 3_000_000),
     LinkCounts(9, 0, Channel.COMMAND, 21, 21, 0, 0, 21, 0, 0.0, 0),
 ]
-DRIVE_FRAME = (0x18FF0102, bytes(range(8)))
+DRIVE_FRAME = Frame(0x102, bytes(range(8)))
 RATE = 10_000_000
 FIELD = re.compile(r"^(/[\w/]+?)(?:\.([\w.\[\]]+))?$")
 
@@ -45,7 +47,7 @@ def record(path: Path, ticks: int = 21, flush_every: int = 0) -> list[Message]:
         for number, message in enumerate(messages):
             recorder.record(message)
             if message.source == 0:
-                recorder.record_frame(message.time_ns, *DRIVE_FRAME)
+                recorder.record_frame(TimedFrame(message.time_ns, 0, 0, DRIVE_FRAME))
             if flush_every and number % flush_every == 0:
                 recorder.flush_if_due(number * chunked.FLUSH_NS)
         recorder.record_links(messages[-1].time_ns, LINKS)
@@ -187,7 +189,7 @@ def test_can_frames_and_links(recorded: tuple[Path, list[Message]]) -> None:
     frames = [message for topic, message in found if topic == "/can/frames"]
     links = [message for topic, message in found if topic == "/links"]
     assert len(frames) == 21
-    assert (frames[0].id, frames[0].is_extended, bytes(frames[0].data)) == (DRIVE_FRAME[0], True, DRIVE_FRAME[1])
+    assert (frames[0].id, frames[0].is_extended, bytes(frames[0].data)) == (DRIVE_FRAME.can_id, False, DRIVE_FRAME.data)
     assert [(link.name, link.sent, link.lost) for link in links] == [("g1/r2 to g1", 21, 1), ("g1 to g1/r2", 21, 0)]
 
 
@@ -335,7 +337,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(
             recorder.record(message)
             if flush_every and number % flush_every == 0:
                 recorder.flush_if_due(number * chunked.FLUSH_NS)
-        recorder.record_frame(0, *DRIVE_FRAME)
+        recorder.record_frame(TimedFrame(0, 0, 0, DRIVE_FRAME))
         recorder.record_links(0, LINKS)
     assert recorder.failure is not None
     assert recorder.failure.startswith(f"{path}: File too large")

@@ -247,10 +247,10 @@ def test_markers(time_ns: int, rows: list[Any]) -> None:
 
 
 @given(times, st.integers(0, 2**29 - 1), st.binary(max_size=8), st.booleans())
-def test_can_frame(time_ns: int, can_id: int, data: bytes, extended: bool) -> None:
+def test_can_frame(time_ns: int, can_id: int, data: bytes, remote: bool) -> None:
     padded = np.frombuffer(data.ljust(8, b"\0"), np.uint8)
-    message = make("can_msgs/Frame", header(time_ns, ""), can_id, False, extended, False, len(data), padded)
-    assert ros.can_frame(ros.stamp(time_ns), can_id, data, extended) == serialized("can_msgs/Frame", message)
+    message = make("can_msgs/Frame", header(time_ns, ""), can_id, remote, can_id > 0x7FF, False, len(data), padded)
+    assert ros.can_frame(ros.stamp(time_ns), can_id, data, remote) == serialized("can_msgs/Frame", message)
 
 
 @given(times, names, st.tuples(*[st.integers(0, 2**63)] * 6), numbers, st.integers(0, 2**62))

@@ -11,6 +11,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from runs import plan_of, trace_of
 
@@ -227,17 +228,23 @@ def test_garbage_is_counted_and_dropped() -> None:
     member = Member(plan, make_role(plan, robot.index))
     member.thread.start()
     noise = random.Random(1)
+    shapeless = 0
     for number, command in enumerate(commands):
         other_version = bytes([command[0] + 1]) + command[1:]
         for garbage in (b"", noise.randbytes(noise.randint(1, 90)), command[:-1], other_version):
             member.receive(garbage)
         member.receive(encode(Message(Channel.COMMAND, 999, number, 0, decode(command).values)))
+        if (message := decode(command)).values.size:
+            for misshapen in (message.values[:-1], np.append(message.values, 0.0)):
+                member.receive(encode(message._replace(values=misshapen)))
+                shapeless += 1
         member.receive(command)
         member.receive(command)  # twice is once
     member.join()
     assert member.failure is None
-    assert sum(member.runner.counts.refused.values()) == 4 * len(commands)
+    assert sum(member.runner.counts.refused.values()) == 5 * len(commands) + shapeless
     assert member.runner.mailbox.unexpected == len(commands)
+    assert member.runner.mailbox.misshapen == shapeless > 0
     assert member.said == of(messages, robot.index, Channel.STATE)
 
 

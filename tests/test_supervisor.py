@@ -186,7 +186,7 @@ def test_a_process_that_stands_still_for_a_while_costs_only_time(
             if f"for {name}" in progress.note and "stopped" in progress.note:
                 os.kill(stopped[0], signal.SIGCONT)
 
-    outcome = supervised(plan, tmp_path, show=watch, can_url="virtual")
+    outcome = supervised(plan, tmp_path, show=watch, can_urls=("virtual",))
     assert outcome.failure is None, notes
     assert any(f"for {name}" in note for note in notes)
     assert outcome.trace.digest() == trace_of(plan).digest()

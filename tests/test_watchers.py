@@ -10,10 +10,12 @@ import pytest
 from invented import METADATA, invented, paper
 
 import sim.watchers
+from bridge.frame import Frame
+from bridge.frame_message import TimedFrame, pack
 from echelon.messages import Channel, Message
 from echelon.wire import encode, join
 from sim.recording import read_metadata, read_trace
-from sim.watchers import Reception, Recording, frames_of
+from sim.watchers import Reception, Recording
 
 TICKS = 6
 
@@ -87,8 +89,9 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
     recording = Recording(tmp_path, paper(), "scenario", METADATA)
     assert recording.progress()["states"] is None
     messages = list(invented(paper(), TICKS))
-    words = np.array([0x101, 0x0807060504030201], dtype="<u8").view(np.float64)
-    frames = Message(Channel.FRAMES, len(paper().members), 0, messages[-1].time_ns, words)
+    end_ns = messages[-1].time_ns
+    timed = TimedFrame(end_ns, 0, 0, Frame(0x101, bytes(range(8))))
+    frames = Message(Channel.FRAMES, len(paper().members), 0, end_ns, pack([timed]))
     recording.add(messages)
     recording.add([])
     recording.add([frames])
@@ -100,10 +103,3 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
     assert (result["messages"], result["failure"]) == (len(messages) + 1, None)
     assert read_trace(tmp_path / "run.mcap", paper()).digest() == result["trace"].digest()
     assert read_metadata(tmp_path / "run.mcap") == METADATA
-
-
-def test_frames_survive_as_numbers() -> None:
-    pairs = [(0x7FF, bytes(range(8))), (0x101, b"\xff" * 8), (0, bytes(8))]  # among them bits that are no number
-    words = [word for identifier, data in pairs for word in (identifier, int.from_bytes(data, "little"))]
-    values = np.array(words, dtype="<u8").view(np.float64)
-    assert list(frames_of(Message(Channel.FRAMES, 1, 0, 0, values))) == pairs

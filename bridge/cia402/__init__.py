@@ -1,0 +1,1 @@
+"""CiA 402 drives over CANopen: cyclic synchronous torque, one node for each wheel."""

@@ -1,0 +1,143 @@
+"""The bridge at work on a closed torque path: its role, its buses, can.log and the DBC; and what there is to tell of them."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from bridge.bus import Bus, listen_command, open_bus
+from bridge.bus_model import BusEventKind
+from bridge.canlog import CanLog
+from bridge.commander import Commander
+from bridge.fit import describe_fit
+from bridge.frame_message import TimedFrame, unpack
+from bridge.on_bus import Rail, on_bus
+from bridge.plan_dbc import dbc_names, plan_dbc
+from echelon.messages import Message
+from echelon.plan import Plan
+from echelon.role import Stage
+
+LOG: Final = "can.log"
+
+
+class ClosedStation:
+    """The bridge of a plan with a closed torque path.  No `urls`: frames go nowhere but into the log.
+
+    `paired`: the drives are on the same buses, in another process; otherwise frames are only shown there.
+    Raises ValueError or OSError if a bus or a file cannot be had.
+    """
+
+    def __init__(
+        self, plan: Plan, urls: Sequence[str], folder: Path, *, paired: bool, role: Commander | None = None
+    ) -> None:
+        self.plan = plan
+        self.role = role or Commander(plan)
+        self.index = self.role.index
+        self.buses: list[Bus] = [open_bus(url) for url in urls]
+        self.urls = [bus.url for bus in self.buses]
+        self.rail = Rail(self.buses)
+        for bus, name in enumerate(dbc_names(plan)):
+            (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
+        # The log begins with the bringing up of the drives; run time 0 is `can.bring_up` later.
+        self._names = [bus.name for bus in plan.can.buses]
+        self._log = CanLog(folder / LOG, self._names[0], plan.can.bring_up_ns)
+        self._paired = paired
+        self.frames = 0
+        self.messages = 0
+        self.stages: tuple[Stage, ...] = self.role.stages
+        if self.buses and paired:
+            self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.note)
+
+    @property
+    def url(self) -> str:
+        """Where the frames can be heard."""
+        return ", ".join(self.urls) or "nowhere"
+
+    def note(self, message: Message) -> None:
+        """Logs the frames of a message of the bridge's; shows them on the bus if nobody else does."""
+        frames = unpack(message.values)
+        self.messages += 1
+        if self.buses and not self._paired:
+            self.rail.put(frames)
+        self.log(frames)
+
+    def log(self, frames: Sequence[TimedFrame]) -> None:
+        """Notes frames in can.log."""
+        wall_ns, write, names = time.monotonic_ns(), self._log.write, self._names
+        for time_ns, bus, _, (can_id, data, remote) in frames:
+            write(time_ns, can_id, data, wall_ns, names[bus], remote)
+        self.frames += len(frames)
+
+    def flush(self) -> None:
+        """Hands what is logged to the operating system."""
+        self._log.flush()
+
+    def close(self) -> None:
+        """Closes log and buses."""
+        self._log.close()
+        for bus in self.buses:
+            bus.close()
+
+    def progress(self) -> dict[str, Any]:
+        """Returns what a live table shows."""
+        stopped = sum(robot.stopped.total() for robot in self.role.robots)
+        faults = [f"{robot.robot.name} {robot.host.fault}" for robot in self.role.robots if robot.host.fault]
+        return {
+            "url": self.url,
+            "load": max(bus.load for bus in self.role.buses),
+            "frames": self.frames,
+            "stopped": stopped,
+            "faults": faults,
+            "note": self.rail.waiting,
+        }
+
+    def result(self) -> dict[str, Any]:
+        """Returns the counts of bridge, buses and log for the summary."""
+        robots = self.role.summary()
+        buses = [self._bus_row(number) for number in range(len(self.role.buses))]
+        return {
+            "path": "closed",
+            "timing": self.plan.can.timing,
+            "url": self.url,
+            "listen": "; ".join(command for url in self.urls if (command := listen_command(url))),
+            "torque_scale": self.plan.can.torque_scale,
+            "log_start": -self.plan.can.bring_up_ns / 1e9,
+            "frames": self.frames,
+            "load_mean": max(row["load"] for row in buses),
+            "fit": "; ".join(describe_fit(self.plan)),
+            "buses": buses,
+            "sent": sum(bus.counts.sent for bus in self.buses),
+            "failed": sum(bus.counts.failed for bus in self.buses),
+            "dropped": sum(bus.counts.dropped for bus in self.buses),
+            "foreign": self.rail.foreign,
+            "log_lost": self._log.counts.lost,
+            "log_error": str(self._log.error) if self._log.error else None,
+            "stopped": sum(sum(row["stopped"].values()) for row in robots.values()),
+            "robots": robots,
+        }
+
+    def _bus_row(self, number: int) -> dict[str, Any]:
+        """Returns what became of the frames on one bus; latencies [s] are from the queue to the end of the frame."""
+        model, plan = self.role.buses[number], self.plan.can.buses[number]
+        traffic = dict(sorted(model.traffic.items()))
+        events = [event for event in model.events if event.kind is not BusEventKind.ERROR]
+        return {
+            "name": plan.name,
+            "bitrate": plan.bitrate,
+            "load": model.load,
+            "lost": sum(row.lost for row in traffic.values()),
+            "destroyed": sum(row.retransmitted for row in traffic.values()),
+            "events": [
+                {"time": event.time_ns / 1e9, "node": event.node, "event": event.kind.value} for event in events[:1000]
+            ],
+            "identifiers": {
+                f"{can_id:03X}": {
+                    "frames": row.delivered,
+                    "lost": row.lost,
+                    "destroyed": row.retransmitted,
+                    "latency_mean": row.latency_mean_ns / 1e9,
+                    "latency_max": row.latency_max_ns / 1e9,
+                }
+                for can_id, row in traffic.items()
+            },
+        }

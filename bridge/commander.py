@@ -1,0 +1,198 @@
+"""The bridge on the closed torque path, as a role: robots' torques in, frames out; feedback in, wheel torques out.
+
+Twice per torque period it has its turn.  First it hears what the drives fed back at this instant, and tells robots the
+torques that their wheels had in the period that ends.  Then it takes the robots' new torques through the envelope, lets
+the hosts make frames of them, and lets the bus carry what it can in the period (bridge.bus_time): that is what the
+drives hear, each frame at its instant.
+
+Feedback is a sample of its instant: the plant, which is not on the bus, takes it without the time it spends there.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from bridge.bus_time import BusTime, IdealBus
+from bridge.cia402.host import Master
+from bridge.envelope import Envelope
+from bridge.frame import Frame, Host
+from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
+from bridge.protocols import drive_places, make_host
+from echelon.messages import Channel, Heard, Message
+from echelon.plan import EventPlan, Plan, RobotPlan
+from echelon.role import Input, Stage
+
+NOT_COMMANDED: Final = "no command"
+"""Why a torque is zero besides the reasons of the envelope: the robot said it has none, or nothing (fresh) came from it."""
+
+
+def make_bus(plan: Plan, number: int) -> BusTime | IdealBus:
+    """Returns the model of one of the plan's buses."""
+    can = plan.can
+    if can.timing == "ideal":
+        return IdealBus()
+    return BusTime(can.buses[number].bitrate, plan.seed, number, capacity=can.queue, restart_ns=can.restart_ns)
+
+
+class Torques:
+    """The way of one robot's torques to its drives: envelope, then host; counts what it stopped, and why."""
+
+    def __init__(self, robot: RobotPlan) -> None:
+        self.robot = robot
+        self.host: Host = make_host(robot)
+        self.envelope = Envelope(robot.envelope)
+        self.stopped: Counter[str] = Counter()
+        self.commands = 0
+        self.largest = 0.0
+        self.estop = False
+
+    def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
+        """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
+        frames = self.host.poll(time_ns)
+        tau_right = tau_left = saturated = 0.0
+        if heard is not None and heard.values[2] == 1.0:
+            tau_right, tau_left, _, saturated = heard.values[:4].tolist()
+            tau_right, tau_left, reason = self.envelope.check(time_ns, heard.time_ns, tau_right, tau_left)
+            if reason is not None:
+                self.stopped[reason] += 1
+            self.largest = max(self.largest, abs(tau_right), abs(tau_left))
+        elif time_ns >= 0:
+            self.stopped[NOT_COMMANDED] += 1
+            self.envelope.stop(time_ns)
+        self.commands += time_ns >= 0
+        return frames + self.host.command(time_ns, tau_right, tau_left, saturated > 0)
+
+    def wheel_torques(self, time_ns: int) -> tuple[float, float]:
+        """Returns what the drives last reported [N m], zeros if that is older than their watchdog."""
+        reported_ns = self.host.torque_ns
+        if reported_ns is None or time_ns - reported_ns > self.robot.drive.watchdog_ns:
+            return 0.0, 0.0
+        return self.host.torque
+
+    def summary(self) -> dict[str, Any]:
+        """Returns the counts."""
+        return {
+            "protocol": self.robot.drive.protocol,
+            "commands": self.commands,
+            "stopped": dict(sorted(self.stopped.items())),
+            "refused": dict(sorted(self.host.refused.items())),
+            "largest": self.largest,
+            "enabled": self.host.enabled,
+            "fault": self.host.fault,
+        }
+
+
+class Commander:
+    """The bridge's role in a plan with a closed torque path."""
+
+    def __init__(self, plan: Plan) -> None:
+        bridge = plan.stations[0]
+        self.index = bridge.index
+        self._first_ns = bridge.first_ns
+        self._period_ns = bridge.period_ns
+        self.robots = [Torques(robot) for robot in plan.robots]
+        self.buses: list[BusTime | IdealBus] = [make_bus(plan, number) for number in range(len(plan.can.buses))]
+        self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
+        for robot in self.robots:
+            listeners = self._listeners[robot.robot.drive.bus]
+            listeners.update(dict.fromkeys(robot.host.identifiers, robot.host))
+        self._masters = {
+            bus: Master(self._period_ns, plan.can.watchdog_ns)
+            for bus in range(len(self.buses))
+            if any(robot.drive.protocol == "cia402" and robot.drive.bus == bus for robot in plan.robots)
+        }
+        self._places = drive_places(plan)
+        self._events = [event for event in plan.events if event.kind != "drive_fault"]
+        self._on: set[int] = set()
+        self.lost: Counter[int] = Counter()
+        """Frames of the bridge that its queue had no room for, by identifier"""
+        deepest = max(node.depth for node in plan.nodes)
+        heard = tuple(Input(station.index, Channel.FRAMES) for station in plan.stations[1:])
+        torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
+        self.stages = (
+            Stage("hear", -2, self._period_ns, heard, self._hear, self._first_ns),
+            Stage("send", 2 * deepest + 4, self._period_ns, torques, self._send, self._first_ns),
+        )
+
+    def _hear(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Takes the drives' frames of this instant; returns the torques of all wheels in the period that ends."""
+        for message in heard:
+            for at_ns, bus, node, frame in unpack(message.values) if message is not None else ():
+                if bus < len(self.buses):
+                    self.buses[bus].send(at_ns, node, frame)
+                    self.receive(at_ns, bus, frame)
+        return () if time_ns < 0 else (self.wheels(time_ns),)
+
+    def receive(self, time_ns: int, bus: int, frame: Frame) -> None:
+        """Takes a frame from a bus."""
+        host = self._listeners[bus].get(frame.can_id)
+        if host is not None:
+            host.receive(time_ns, frame)
+
+    def wheels(self, time_ns: int) -> Message:
+        """Returns the torques of all wheels as last reported."""
+        torques = [torque for robot in self.robots for torque in robot.wheel_torques(time_ns)]
+        return Message(Channel.WHEELS, self.index, time_ns // self._period_ns, time_ns, np.array(torques))
+
+    def _send(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Puts the frames of this cycle on the bus; returns all frames that the buses carry until the next one."""
+        self.apply_events(time_ns)
+        for robot, message in zip(self.robots, heard, strict=True):
+            self._queue(time_ns, robot.robot.drive.bus, robot.frames(time_ns, message))
+        end_ns = time_ns + self._period_ns
+        for bus, master in self._masters.items():
+            self._queue(time_ns, bus, master.poll(time_ns))
+            sync = master.sync()
+            # It ends with the period, so that all drives sample then.
+            self._queue(end_ns - self.buses[bus].duration_ns(sync), bus, [sync])
+        carried = [
+            TimedFrame(sent.end_ns, number, sent.node, sent.frame)
+            for number, bus in enumerate(self.buses)
+            for sent in bus.run(end_ns)
+        ]
+        if len(self.buses) > 1:
+            carried.sort(key=lambda timed: timed.time_ns)
+        sequence = (time_ns - self._first_ns) // self._period_ns
+        return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(carried)),)
+
+    def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
+        send = self.buses[bus].send
+        for frame in frames:
+            if not send(time_ns, BRIDGE_NODE, frame):
+                self.lost[frame.can_id] += 1
+
+    def apply_events(self, time_ns: int) -> None:
+        """Makes happen what the scenario has for this instant."""
+        for number, event in enumerate(self._events):
+            on = event.at_ns <= time_ns < event.until_ns
+            if on == (number in self._on):
+                continue
+            self._on ^= {number}
+            if event.kind == "estop":
+                for robot in event.robots:
+                    self._estop(robot, time_ns, on)
+            elif event.kind == "error_frames":
+                for bus in event.buses:
+                    self.buses[bus].set_error_rate(event.rate if on else 0.0)
+            elif event.kind == "bus_off" and on:
+                for bus, node in self._nodes_of(event):
+                    self.buses[bus].bus_off(node)
+
+    def _nodes_of(self, event: EventPlan) -> list[tuple[int, int]]:
+        """Returns bus and node of the controllers that an event is about: the bridge's, or those of robots' drives."""
+        if not event.robots:
+            return [(bus, BRIDGE_NODE) for bus in event.buses]
+        return [(place.bus, place.node) for place in self._places if place.robot in event.robots]
+
+    def _estop(self, robot: int, time_ns: int, on: bool) -> None:
+        torques = self.robots[robot]
+        if on:
+            self._queue(time_ns, torques.robot.drive.bus, torques.host.stop(time_ns))
+        else:
+            torques.host.start()
+
+    def summary(self) -> dict[str, Any]:
+        """Returns what the bridge saw of every robot."""
+        return {robot.robot.name: robot.summary() for robot in self.robots}

@@ -1,0 +1,129 @@
+"""The virtual drives of a plan as a role: what the bus carries in, what drives answer and report out.
+
+Once per torque period the drives report: what they send on their own, and what they have to answer, at this instant.
+At its end they serve what the bridge says the bus carries until the next one, each frame at its instant.  Their wheels
+turn as the robots say; the torque that reaches a robot is what its drives report.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from bridge.frame import Drive, Frame
+from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
+from bridge.motor import Fault
+from bridge.protocols import DrivePlace, drive_places, make_drive
+from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
+from echelon.plan import Plan
+from echelon.role import Input, Stage
+
+_SPEED = TORQUE_FIELDS.index("speed_right")
+
+
+class PlacedDrive:
+    """A drive, its place on a bus, and what it has yet to send."""
+
+    def __init__(self, plan: Plan, place: DrivePlace) -> None:
+        self.place = place
+        self.drive: Drive = make_drive(plan, place)
+        self.outbox: list[Frame] = []
+        self.waiting = 0
+        """Frames that it sent and that the bus did not carry yet"""
+        self.lost = 0
+        """Frames that its queue had no room for"""
+
+    def take(self, time_ns: int, frame: Frame) -> None:
+        """Takes a frame from the bus; answers are sent with the next report."""
+        self.outbox += self.drive.advance(time_ns)
+        self.outbox += self.drive.receive(time_ns, frame)
+
+
+class DriveBank:
+    """All virtual drives of a plan, on all its buses."""
+
+    def __init__(self, plan: Plan) -> None:
+        bridge, drives = plan.stations
+        self.index = drives.index
+        self._first_ns = drives.first_ns
+        self._plan = plan
+        self._period_ns = drives.period_ns
+        self._capacity = plan.can.queue if plan.can.timing == "bits" else 1 << 62
+        self.drives = [PlacedDrive(plan, place) for place in drive_places(plan)]
+        self._listeners: list[dict[int, list[PlacedDrive]]] = [{} for _ in plan.can.buses]
+        for placed in self.drives:
+            for can_id in placed.drive.identifiers:
+                self._listeners[placed.place.bus].setdefault(can_id, []).append(placed)
+        self._events = [event for event in plan.events if event.kind == "drive_fault"]
+        self._on: set[int] = set()
+        robots = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
+        deepest = max(node.depth for node in plan.nodes)
+        self.stages = (
+            Stage("report", -3, self._period_ns, (), self._report, self._first_ns),
+            Stage(
+                "serve",
+                2 * deepest + 5,
+                self._period_ns,
+                (Input(bridge.index, Channel.FRAMES), *robots),
+                self._serve,
+                self._first_ns,
+            ),
+        )
+
+    def _report(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Returns what all drives send at an instant."""
+        self.apply_events(time_ns)
+        said = []
+        for placed in self.drives:
+            frames = placed.outbox + placed.drive.advance(time_ns)
+            placed.outbox = []
+            room = max(0, self._capacity - placed.waiting)
+            placed.lost += max(0, len(frames) - room)
+            for frame in frames[:room]:
+                placed.waiting += 1
+                said.append(TimedFrame(time_ns, placed.place.bus, placed.place.node, frame))
+        sequence = (time_ns - self._first_ns) // self._period_ns
+        return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(said)),)
+
+    def _serve(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Lets the drives work through what the buses carry until the next report."""
+        frames, *robots = heard
+        for placed in self.drives:
+            message = robots[placed.place.robot]
+            if message is not None:
+                for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):
+                    motor.set_speed(time_ns, float(message.values[_SPEED + wheel]))
+        for timed in unpack(frames.values) if frames is not None else ():
+            if timed.node != BRIDGE_NODE:
+                self.drives[timed.node - 1].waiting -= 1
+            elif timed.bus < len(self._listeners):
+                for placed in self._listeners[timed.bus].get(timed.frame.can_id, ()):
+                    placed.take(timed.time_ns, timed.frame)
+        return ()
+
+    def apply_events(self, time_ns: int) -> None:
+        """Makes the scenario's faults happen that are due, and go away."""
+        for number, event in enumerate(self._events):
+            on = event.at_ns <= time_ns < event.until_ns
+            if on == (number in self._on):
+                continue
+            self._on ^= {number}
+            for placed in self.drives:
+                if placed.place.robot not in event.robots:
+                    continue
+                for wheel in set(placed.place.wheels) & set(event.wheels):
+                    if on:
+                        placed.outbox += placed.drive.inject(time_ns, wheel, Fault(event.fault))
+                    else:
+                        placed.drive.mend(time_ns, wheel, Fault(event.fault))
+
+    def summary(self) -> dict[str, Any]:
+        """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""
+        rows: dict[str, dict[str, Any]] = {
+            robot.name: {"refused": Counter[str](), "lost": 0, "temperature": 0.0} for robot in self._plan.robots
+        }
+        for placed in self.drives:
+            row = rows[self._plan.robots[placed.place.robot].name]
+            row["refused"] += placed.drive.refused
+            row["lost"] += placed.lost
+            row["temperature"] = max(row["temperature"], *(motor.temperature for motor in placed.drive.motors))
+        return rows

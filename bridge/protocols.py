@@ -1,0 +1,60 @@
+"""The drive protocols by their names in a scenario: which host, drives, observer and DBC messages go with each."""
+
+from importlib import import_module
+from typing import Any, Final, NamedTuple
+
+from bridge.frame import Drive, Host
+from bridge.observe import Observer
+from echelon.plan import DrivePlan, Plan, RobotPlan
+
+PREFIX: Final = {"native": "Native", "odrive": "ODrive", "cia402": "Cia402"}
+"""How the classes of a protocol begin; its modules are `bridge.<protocol>.host` and so on."""
+
+
+def _part(protocol: str, module: str, kind: str) -> Any:
+    return getattr(import_module(f"bridge.{protocol}.{module}"), PREFIX[protocol] + kind)
+
+
+class DrivePlace(NamedTuple):
+    """Where a virtual drive is: its robot, the wheels (0 right, 1 left) whose motors it has, its bus, its node there."""
+
+    robot: int
+    wheels: tuple[int, ...]
+    bus: int
+    node: int
+
+
+def drive_places(plan: Plan) -> list[DrivePlace]:
+    """Lists the drives of a plan; their nodes are numbered from 1 on, after the bridge."""
+    places: list[DrivePlace] = []
+    for robot in plan.robots:
+        for wheels in ((0, 1),) if robot.drive.protocol == "native" else ((0,), (1,)):
+            places.append(DrivePlace(robot.index, wheels, robot.drive.bus, len(places) + 1))
+    return places
+
+
+def make_host(robot: RobotPlan) -> Host:
+    """Returns what commands a robot's drives."""
+    host: Host = _part(robot.drive.protocol, "host", "Host")(robot.drive, robot.index)
+    return host
+
+
+def make_drive(plan: Plan, place: DrivePlace) -> Drive:
+    """Returns a virtual drive."""
+    drive = plan.robots[place.robot].drive
+    which = place.robot if drive.protocol == "native" else place.wheels[0]
+    made: Drive = _part(drive.protocol, "drive", "Drive")(drive, which)
+    return made
+
+
+def make_observer(robot: RobotPlan) -> Observer:
+    """Returns what listens to a robot's frames."""
+    observer: Observer = _part(robot.drive.protocol, "observe", "Observer")(robot.drive, robot.envelope, robot.index)
+    return observer
+
+
+def dbc_messages(drive: DrivePlan, robot: str, number: int) -> list[Any]:
+    """Returns the DBC messages of a robot's drives."""
+    make = import_module(f"bridge.{drive.protocol}.dbc").messages
+    found: list[Any] = make(drive, robot, number) if drive.protocol == "native" else make(drive, robot)
+    return found

@@ -1,0 +1,151 @@
+"""The part of a scenario that concerns the CAN bus: drives, envelope, buses, and what happens on schedule."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from echelon.values import Bitrate, Finite, Flag, Fraction, Limit, Name, NodeId, NonNegative, Positive, Table
+
+
+class DriveTable(Table):
+    """The drives of a robot's wheels, and their motors; both wheels have the same."""
+
+    protocol: Literal["native", "odrive", "cia402"] | None = None
+    """`native` (one frame for both wheels, counter and CRC), `odrive` (CANSimple 0.6) or `cia402` (cyclic synchronous
+    torque over CANopen)"""
+    node_ids: tuple[NodeId, NodeId] | None = None
+    """Of the right and the left wheel's drive; by default two numbers of the robot's own"""
+    recover_after: Positive | None = None
+    """So long after a fault the bridge clears it and enables the drive anew [s]; never unless given"""
+    torque_limit: Positive | None = None
+    """Largest torque of the motor [N m]; the robot's limit unless given"""
+    rated_torque: Positive | None = None
+    """Torque that the motor can give for ever [N m]; CiA 402 counts in thousandths of it"""
+    torque_slew: Limit | None = None
+    """Largest change of torque [N m/s]"""
+    lag: NonNegative | None = None
+    """Time constant of the current loop [s]"""
+    torque_constant: Positive | None = None
+    """K_t [N m/A]"""
+    resistance: NonNegative | None = None
+    """Of the winding, which its current heats [Ω]"""
+    thermal_resistance: Positive | None = None
+    """From winding to ambient [K/W]"""
+    thermal_time: Positive | None = None
+    """Time constant of the winding's temperature [s]"""
+    ambient: Finite | None = None
+    """[°C]"""
+    derating_from: Finite | None = None
+    """From this temperature on the torque limit falls [°C], linearly, to zero at `temperature_limit`"""
+    temperature_limit: Finite | None = None
+    """Over-temperature fault from here on [°C]"""
+    supply_voltage: Positive | None = None
+    """[V]"""
+    supply_resistance: NonNegative | None = None
+    """Of battery and cables [Ω]"""
+    brown_out: NonNegative | None = None
+    """Under this voltage the drive gives up [V]"""
+    encoder_counts: Annotated[int, Field(strict=True, ge=1, le=1 << 24)] | None = None
+    """Per revolution of the wheel"""
+    inertia: Positive | None = None
+    """Of a wheel on a bench, where no robot turns it [kg m²]"""
+    friction: NonNegative | None = None
+    """Of that wheel [N m s/rad]"""
+
+
+class EnvelopeTable(Table):
+    """The last gate before the bus: what it does not let pass becomes zero torque, and is counted."""
+
+    torque_limit: Limit | None = None
+    """Largest torque of a wheel [N m]"""
+    rise_limit: Limit | None = None
+    """Largest growth of a torque's magnitude from frame to frame [N m]"""
+    fall_limit: Limit | None = None
+    """Largest decrease of a torque's magnitude from frame to frame [N m]"""
+    window_limit: Limit | None = None
+    """Largest difference between two torques within 250 ms [N m]"""
+    stale_after: Positive | None = None
+    """Age from which on a robot's torque is not used any more [s]; `can.watchdog` unless given"""
+
+
+class Bus(Table):
+    """One of several buses."""
+
+    url: str | None = None
+    bitrate: Bitrate | None = None
+
+
+class Can(Table):
+    """The CAN bus, or buses."""
+
+    enabled: Flag = True
+    url: str = "auto"
+    """`socketcan:vcan0`, `udp_multicast:…`, `virtual`; `auto` takes vcan0 where it is up, else udp_multicast"""
+    bitrate: Bitrate = 1_000_000
+    """[bit/s]"""
+    buses: dict[Name, Bus] = {}
+    """Several buses by name, each with a `url` and a `bitrate` of its own if need be; robots say theirs with `bus`"""
+    torque_scale: Positive = 0.001
+    """Newton metres per bit of the native torque frame; ±32767 bits fit"""
+    path: Literal["mirror", "closed"] = "mirror"
+    """`mirror`: the plant takes the computed torque, the bus shows it.  `closed`: the plant takes what the drives report,
+    which is what they decoded from the frames"""
+    timing: Literal["bits", "ideal"] = "bits"
+    """How long frames take in virtual time on the closed path: as on a real bus, or no time at all"""
+    virtual_drives: Flag = True
+    """On the closed path: False leaves the bus to drives that are there already (wall clock only)"""
+    watchdog: Positive = 0.1
+    """A drive that hears no torque, and a bridge that hears no robot, for so long take the torque away [s]"""
+    bring_up: Positive = 1.0
+    """How long before run time 0 the bridge begins to enable the drives [s]"""
+    queue: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 64
+    """Frames that may wait to be sent, in the bridge and in each drive, before further ones are lost"""
+    restart: NonNegative = 0.1
+    """How long a controller that went bus-off waits before it tries to come back [s]"""
+
+
+class DriveFault(Table):
+    """A fault of a drive."""
+
+    kind: Literal["drive_fault"]
+    at: NonNegative
+    """[s]"""
+    duration: Positive | None = None
+    """Until its cause goes away [s]; never unless given.  What it latched stays latched until it is cleared"""
+    robot: str = "**"
+    """A path in the tree, which may hold `*` and `**`"""
+    wheel: Literal["right", "left", "both"] = "both"
+    fault: Literal["over_temperature", "encoder_loss", "brown_out", "stuck_torque", "silent"]
+
+
+class Estop(Table):
+    """Emergency stop: the bridge takes the torque away and disables the drives, for good unless it has a `duration`."""
+
+    kind: Literal["estop"]
+    at: NonNegative
+    duration: Positive | None = None
+    robot: str = "**"
+
+
+class ErrorFrames(Table):
+    """Disturbances on a bus: each attempt to send a frame is destroyed with a probability, and repeated (timing `bits`)."""
+
+    kind: Literal["error_frames"]
+    at: NonNegative
+    duration: Positive | None = None
+    bus: Name | None = None
+    """All buses unless given"""
+    rate: Fraction
+
+
+class BusOff(Table):
+    """A CAN controller goes bus-off, and comes back after `can.restart` and 128 times 11 idle bits (timing `bits`)."""
+
+    kind: Literal["bus_off"]
+    at: NonNegative
+    bus: Name | None = None
+    robot: str | None = None
+    """Whose drives' controllers; the bridge's unless given"""
+
+
+Event = Annotated[DriveFault | Estop | ErrorFrames | BusOff, Field(discriminator="kind")]

@@ -1,0 +1,194 @@
+"""What a plan says of drives: from the scenario's tables to drives, envelopes, buses, and events, all checked.
+
+Raises PlanError with the key, the value and what is allowed.
+"""
+
+from collections.abc import Iterable, Sequence
+from math import ceil, inf
+from typing import Any, Final
+
+from echelon.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop, Event
+from echelon.plan import NEVER_NS, BusPlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan, MotorPlan, PlanError, RobotPlan
+from echelon.values import path_matches
+
+RAW_MAX: Final = 32767
+"""Largest number of bits in a torque frame."""
+HOST_NODE: Final = 127
+"""The bridge's own node id on a CANopen bus."""
+ODRIVE_NODES: Final = 62
+"""Largest node id of an ODrive; 63 is for those without one."""
+MOTOR_DEFAULTS: Final[dict[str, Any]] = {
+    "torque_slew": inf,
+    "lag": 0.0,
+    "torque_constant": 0.1,
+    "resistance": 0.0,
+    "thermal_resistance": 2.0,
+    "thermal_time": 60.0,
+    "ambient": 25.0,
+    "derating_from": 80.0,
+    "temperature_limit": 100.0,
+    "supply_voltage": 24.0,
+    "supply_resistance": 0.0,
+    "brown_out": 18.0,
+    "encoder_counts": 4096,
+    "inertia": 0.01,
+    "friction": 0.01,
+}
+"""A motor that does at once what it is told, and never gets warm."""
+FIRST_BUS: Final = "can0"
+"""The name of the bus where a scenario names none; and what it is called in can.log."""
+
+
+def make_can(can: Can, cycle_ns: int) -> CanPlan:
+    """Returns the plan of the buses; `cycle_ns` is the period of torque frames."""
+    buses = [BusPlan(name, bus.url or can.url, bus.bitrate or can.bitrate) for name, bus in can.buses.items()] or [
+        BusPlan(FIRST_BUS, can.url, can.bitrate)
+    ]
+    urls = [bus.url for bus in buses if bus.url not in ("auto", "virtual")]
+    if twice := [url for url in urls if urls.count(url) > 1]:
+        raise PlanError(f"can.buses: {twice[0]!r} is the url of more than one; each needs its own")
+    return CanPlan(
+        enabled=can.enabled,
+        buses=tuple(buses),
+        torque_scale=can.torque_scale,
+        path=can.path,
+        timing=can.timing,
+        virtual_drives=can.virtual_drives,
+        watchdog_ns=round(can.watchdog * 1e9),
+        bring_up_ns=ceil(round(can.bring_up * 1e9) / cycle_ns) * cycle_ns,
+        queue=can.queue,
+        restart_ns=round(can.restart * 1e9),
+    )
+
+
+class DriveMaker:
+    """Makes the drives of robots, one robot after the other: node ids are given out in their order."""
+
+    def __init__(self, can: Can, plan: CanPlan) -> None:
+        self._can, self._plan = can, plan
+        self._next: dict[tuple[int, str], int] = {}
+        self._taken: list[dict[int, str]] = [{} for _ in plan.buses]
+
+    def drive(self, values: dict[str, Any], key: str, robot: int, path: str, period_ns: int) -> DrivePlan:
+        """Returns the drives of a robot with these (inherited) values; takes `bus` and `drive` out of them."""
+        bus, table = self._bus(values.pop("bus", None), key), DriveTable(**values.pop("drive", None) or {})
+        protocol = table.protocol or "native"
+        given = table.model_dump(exclude_none=True, exclude={"protocol", "node_ids", "recover_after"})
+        most = min(values["torque_limit"], RAW_MAX * self._can.torque_scale)
+        motor = MOTOR_DEFAULTS | {"torque_limit": most, "rated_torque": most} | given
+        if motor["derating_from"] >= motor["temperature_limit"]:
+            raise PlanError(
+                f"{key}.drive.derating_from = {motor['derating_from']}: must be less than temperature_limit = "
+                f"{motor['temperature_limit']}"
+            )
+        plan = DrivePlan(
+            protocol=protocol,
+            bus=bus,
+            node_ids=self._node_ids(table, protocol, bus, robot, f"{key}.drive"),
+            period_ns=period_ns,
+            watchdog_ns=self._plan.watchdog_ns,
+            torque_scale=self._can.torque_scale,
+            recover_ns=None if table.recover_after is None else round(table.recover_after * 1e9),
+            motor=MotorPlan(**motor),
+        )
+        self._take(plan, robot, path, f"{key}.drive")
+        return plan
+
+    def envelope(self, values: dict[str, Any]) -> EnvelopePlan:
+        """Returns the envelope of a robot with these (inherited) values; takes `envelope` out of them."""
+        table = EnvelopeTable(**values.pop("envelope", None) or {})
+        return EnvelopePlan(
+            torque_limit=values["torque_limit"] if table.torque_limit is None else table.torque_limit,
+            rise_limit=inf if table.rise_limit is None else table.rise_limit,
+            fall_limit=inf if table.fall_limit is None else table.fall_limit,
+            window_limit=inf if table.window_limit is None else table.window_limit,
+            stale_ns=self._plan.watchdog_ns if table.stale_after is None else round(table.stale_after * 1e9),
+        )
+
+    def _bus(self, name: str | None, key: str) -> int:
+        names = [bus.name for bus in self._plan.buses]
+        if name is None:
+            return 0
+        if name not in names:
+            raise PlanError(f"{key}.bus = {name!r}: must be one of {', '.join(map(repr, names))}")
+        return names.index(name)
+
+    def _node_ids(self, table: DriveTable, protocol: str, bus: int, robot: int, key: str) -> tuple[int, int]:
+        if protocol == "native":
+            if table.node_ids is not None:
+                raise PlanError(f"{key}.node_ids: not for the native protocol, which goes by the robot's number")
+            return robot, robot
+        first = self._next.get((bus, protocol), 1)
+        right, left = table.node_ids or (first, first + 1)
+        least, most = (0, ODRIVE_NODES) if protocol == "odrive" else (1, HOST_NODE - 1)
+        if right == left or not (least <= right <= most and least <= left <= most):
+            what = f"{key}.node_ids = [{right}, {left}]: two different ones from {least} to {most}"
+            hint = "" if table.node_ids else "; put some robots on another bus (can.buses)"
+            raise PlanError(f"{what} are needed for {protocol}{hint}")
+        self._next[bus, protocol] = max(first, right + 1, left + 1)
+        return right, left
+
+    def _take(self, plan: DrivePlan, robot: int, path: str, key: str) -> None:
+        """Refuses drives that share identifiers with those of another robot on their bus."""
+        taken = self._taken[plan.bus]
+        own, shared = identifiers(plan, robot)
+        for can_id in own | shared:
+            other = taken.get(can_id)
+            if other is not None and not (can_id in shared and other == ""):
+                who = f"with those of {other}" if other else "with CANopen's management on the same bus"
+                raise PlanError(
+                    f"{key}: identifier {can_id:#05x} of {path} collides {who}; give other node_ids, or another bus"
+                )
+        taken.update(dict.fromkeys(own, path) | dict.fromkeys(shared, ""))
+
+
+def identifiers(drive: DrivePlan, robot: int) -> tuple[set[int], set[int]]:
+    """Returns the identifiers that a robot's drives use alone, and those they share with drives of the same protocol."""
+    if drive.protocol == "native":
+        return {0x100 + robot, 0x180 + robot, 0x200 + robot}, set()
+    if drive.protocol == "odrive":
+        return {node << 5 | command for node in drive.node_ids for command in range(32)}, set()
+    functions = (0x080, 0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500, 0x580, 0x600, 0x700)
+    return {base + node for node in drive.node_ids for base in functions}, {0x000, 0x080, 0x700 + HOST_NODE}
+
+
+def make_events(events: Iterable[Event], robots: Sequence[RobotPlan], can: CanPlan) -> tuple[EventPlan, ...]:
+    """Returns the events in the order of their times."""
+    plans = []
+    for number, event in enumerate(events):
+        key = f"events.{number}"
+        if not can.closed:
+            raise PlanError(f"{key}.kind = {event.kind!r}: needs can.path = 'closed'")
+        at_ns = round(event.at * 1e9)
+        duration = getattr(event, "duration", None)
+        until_ns = NEVER_NS if duration is None else at_ns + round(duration * 1e9)
+        match event:
+            case DriveFault():
+                wheels = {"right": (0,), "left": (1,), "both": (0, 1)}[event.wheel]
+                hit = _robots(event.robot, robots, key)
+                plans.append(EventPlan(event.kind, at_ns, until_ns, hit, wheels, event.fault))
+            case Estop():
+                plans.append(EventPlan(event.kind, at_ns, until_ns, _robots(event.robot, robots, key)))
+            case ErrorFrames():
+                buses = _buses(event.bus, can, key)
+                plans.append(EventPlan(event.kind, at_ns, until_ns, buses=buses, rate=event.rate))
+            case BusOff():
+                hit = () if event.robot is None else _robots(event.robot, robots, key)
+                plans.append(EventPlan(event.kind, at_ns, until_ns, hit, buses=_buses(event.bus, can, key)))
+    return tuple(sorted(plans, key=lambda plan: plan.at_ns))
+
+
+def _robots(pattern: str, robots: Sequence[RobotPlan], key: str) -> tuple[int, ...]:
+    found = tuple(robot.index for robot in robots if path_matches(pattern, robot.path))
+    if not found:
+        raise PlanError(f"{key}.robot = {pattern!r}: fits no robot")
+    return found
+
+
+def _buses(name: str | None, can: CanPlan, key: str) -> tuple[int, ...]:
+    names = [bus.name for bus in can.buses]
+    if name is None:
+        return tuple(range(len(names)))
+    if name not in names:
+        raise PlanError(f"{key}.bus = {name!r}: must be one of {', '.join(map(repr, names))}")
+    return (names.index(name),)

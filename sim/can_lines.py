@@ -1,0 +1,56 @@
+"""What a summary says of the bus, in lines for people: frames, what was stopped and why, faults, the referee's findings."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+SHOWN: Final = 5
+"""How many of many are listed."""
+
+
+def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
+    """Yields the lines of a terminal."""
+    if not can.get("frames"):
+        return
+    facts = [f"{can['frames']} frames"]
+    if can.get("path") == "closed":
+        facts += [f"{number} {what}" for what, number in _bus_counts(can).items() if number]
+    else:
+        facts.append(f"{can.get('clipped', 0)} clipped")
+    yield f"  CAN      {', '.join(facts)}; {can.get('fit', '')}"
+    if stopped := stopped_by_reason(can):
+        reasons = ", ".join(f"{number} {reason}" for reason, number in stopped.most_common(SHOWN))
+        yield f"  stopped  torques that became zero before the bus: {reasons}"
+    faults = [f"{name} {row['fault']}" for name, row in can.get("robots", {}).items() if row.get("fault")]
+    if faults:
+        yield f"  drives   faults at the end: {_some(faults)}"
+    if referee := can.get("referee"):
+        found = ", ".join(f"{number} {kind}" for kind, number in referee["kinds"].items()) or "nothing wrong"
+        yield f"  referee  {referee['frames']} frames: {found}"
+
+
+def can_reasons(can: Mapping[str, Any]) -> list[str]:
+    """Returns why the verdict fails for what was on the bus: the referee's findings."""
+    referee = can.get("referee")
+    if not referee or not referee["kinds"]:
+        return []
+    total, first = sum(referee["kinds"].values()), referee["findings"][0]
+    return [f"referee: {total} finding(s) on the bus, the first at {first['time']:.6g} s: {first['text']}"]
+
+
+def stopped_by_reason(can: Mapping[str, Any]) -> Counter[str]:
+    """Returns how many torques became zero before the bus, by reason, over all robots."""
+    return sum((Counter(row.get("stopped", {})) for row in can.get("robots", {}).values()), Counter[str]())
+
+
+def _bus_counts(can: Mapping[str, Any]) -> dict[str, int]:
+    buses = can.get("buses", ())
+    lost = sum(bus["lost"] for bus in buses) + sum(
+        row["lost"] for row in can.get("drives", {}).get("robots", {}).values()
+    )
+    return {"lost": lost, "destroyed and sent again": sum(bus["destroyed"] for bus in buses)}
+
+
+def _some(texts: list[str]) -> str:
+    more = f", and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
+    return ", ".join(texts[:SHOWN]) + more

@@ -1,0 +1,157 @@
+"""A native drive on a real SocketCAN interface: seen by a plain socket, by candump and by cantools."""
+
+import re
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from bridge.bus import open_bus
+from bridge.dbc import torque_dbc
+from bridge.frame import Frame
+from bridge.motor import Fault
+from bridge.native.codec import FaultCode, Feedback, NativeCodec, WheelState
+from bridge.native.drive import NativeDrive
+from bridge.native.host import NativeHost
+from tests.bench_drives import MS, Bench, drive_plan
+
+pytestmark = pytest.mark.vcan
+
+URL = "socketcan:vcan0"
+ROBOT = 3
+COMMAND, FEEDBACK = 0x103, 0x183
+PLAN = drive_plan("native", watchdog_ns=500 * MS)  # a guest may stand still for a while
+CODEC = NativeCodec(PLAN.torque_scale)
+ON, FAULT = WheelState.ENABLED, WheelState.FAULT
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with Bench(URL, [NativeDrive(PLAN, ROBOT)]) as running:
+        yield running
+
+
+class Client:
+    """Commands a drive through the kernel's own interface."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", FEEDBACK, 0x7FF))
+        self.socket.bind(("vcan0",))
+        self.socket.settimeout(10.0)
+        self.counter = 0
+
+    def command(self, right: float, left: float, clear: bool = False) -> None:
+        self.counter += 1
+        data, _ = CODEC.encode(ROBOT, right, left, self.counter, enable=(not clear, not clear), clear=clear)
+        self.socket.send(struct.pack("=IB3x8s", COMMAND, 8, data))
+
+    def heard(self) -> Feedback:
+        can_id, length, data = struct.unpack("=IB3x8s", self.socket.recv(16))
+        feedback = CODEC.decode_feedback(can_id, data[:length])
+        assert isinstance(feedback, Feedback)
+        return feedback
+
+    def hold(self, right: float, left: float, wanted: Callable[[Feedback], bool], clear: bool = False) -> Feedback:
+        """Commands with every feedback until one is as wanted."""
+        for _ in range(500):
+            feedback = self.heard()
+            if wanted(feedback):
+                return feedback
+            self.command(right, left, clear)
+        raise AssertionError(f"never as wanted, last {feedback}")
+
+
+@pytest.fixture
+def client() -> Iterator[Client]:
+    made = Client()
+    with made.socket:
+        yield made
+
+
+def test_enable_torque_and_watchdog(bench: Bench, client: Client) -> None:
+    assert client.heard().states == (WheelState.DISABLED,) * 2
+    client.hold(0.0, 0.0, lambda said: said.states == (ON, ON))
+    client.hold(0.5, -0.25, lambda said: said.torques == pytest.approx((0.5, -0.25)))
+    with bench.lock:
+        right, left = bench.drives[0].motors
+        assert right.omega > 0 > left.omega
+    before_ns = time.monotonic_ns()
+    client.command(0.5, -0.25)
+    said = client.heard()
+    while said.states != (FAULT, FAULT):
+        said = client.heard()
+    assert time.monotonic_ns() - before_ns >= PLAN.watchdog_ns
+    assert said.faults == (FaultCode.WATCHDOG, FaultCode.WATCHDOG)
+    client.heard()
+    assert client.heard().torques == (0.0, 0.0)
+    for _ in range(5):
+        client.command(0.5, 0.5)
+        said = client.heard()
+        assert (said.states, said.torques) == ((FAULT, FAULT), (0.0, 0.0))
+    client.hold(0.0, 0.0, lambda said: FAULT not in said.states, clear=True)
+    client.hold(0.0, 0.0, lambda said: said.states == (ON, ON))
+    client.hold(-0.5, 0.5, lambda said: said.torques == pytest.approx((-0.5, 0.5)))
+
+
+def test_a_fault_made_to_happen(bench: Bench, client: Client) -> None:
+    client.hold(0.0, 0.0, lambda said: said.states == (ON, ON))
+    bench.inject(0, 1, Fault.OVER_TEMPERATURE)
+    said = client.hold(0.5, 0.5, lambda said: said.states == (ON, FAULT))
+    assert said.faults == (FaultCode.NONE, FaultCode.OVER_TEMPERATURE)
+    bench.mend(0, 1, Fault.OVER_TEMPERATURE)
+    client.hold(0.0, 0.0, lambda said: FAULT not in said.states, clear=True)
+
+
+def test_our_host_brings_the_drive_up(bench: Bench) -> None:
+    host, last_ns = NativeHost(PLAN, ROBOT), 0
+    with open_bus(URL) as bus:
+        for _ in range(500):
+            received = bus.recv(10.0)
+            assert received is not None
+            if received.can_id not in host.identifiers:
+                continue
+            now_ns = time.monotonic_ns()
+            host.receive(now_ns, Frame(received.can_id, received.data))
+            if host.torque == pytest.approx((1.0, -1.0)):
+                break
+            if host.torque_ns != last_ns:  # a cycle with each feedback
+                last_ns = now_ns
+                for frame in host.poll(now_ns) + host.command(now_ns, 1.0, -1.0):
+                    bus.send(frame.can_id, frame.data)
+        assert host.enabled
+        assert host.torque == pytest.approx((1.0, -1.0))
+    assert (host.refused, host.fault) == ({}, "")
+
+
+def test_candump_and_cantools_show_what_the_drive_says(bench: Bench, client: Client, tmp_path: Path) -> None:
+    client.hold(0.0, 0.0, lambda said: said.states == (ON, ON))
+    dbc = tmp_path / "native.dbc"
+    dbc.write_text(torque_dbc(["a", "b", "c", "g1/r4"], PLAN.torque_scale, PLAN.period_ns))
+    with (
+        subprocess.Popen(["candump", "vcan0", "-n", "60", "-T", "10000"], stdout=subprocess.PIPE) as one,
+        subprocess.Popen(
+            [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)],
+            stdin=one.stdout,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as two,
+    ):
+        while one.poll() is None:
+            client.heard()
+            client.command(0.375, -0.125)
+        assert one.stdout is not None
+        one.stdout.close()
+        shown = two.communicate(timeout=50)[0].splitlines()
+    assert len(shown) == 60
+    assert {found[1] for line in shown if (found := re.search(r":: (\w+)\(", line))} == {
+        f"{kind}_g1_r4" for kind in ("torque", "feedback", "status")
+    }
+    said = [line for line in shown if "mean_tau_right: 0.375 Nm, mean_tau_left: -0.125 Nm" in line]
+    assert len(said) > 10
+    assert all("state_right: enabled, state_left: enabled," in line for line in said)

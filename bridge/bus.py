@@ -6,8 +6,8 @@
     virtual[:channel]                    inside this process
     auto                                 socketcan:vcan0 where that exists and is up, else udp_multicast on a free port
 
-Frames are classic ones with 11-bit identifiers. On udp_multicast a bus also receives what it sent itself, and all
-groups that share a port on one host hear each other: two buses need two ports. Its datagrams do not leave the host.
+Frames are classic ones with 11-bit identifiers. On udp_multicast all groups that share a port on one host hear each
+other: two buses need two ports. Its datagrams do not leave the host. What a bus sent itself it does not receive.
 """
 
 import errno
@@ -18,6 +18,7 @@ import re
 import socket
 import struct
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
@@ -34,6 +35,7 @@ _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of linux/can.h
 _REMOTE = 0x40000000  # CAN_RTR_FLAG
 _BUFFER = 4 << 20
 _TRIES = 10
+_ECHOES = 1024  # frames sent over multicast that may still be on their way back
 _PAUSE = 0.0005  # [s]; with _TRIES, one full queue holds the caller up for 5 ms at most
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
 _GONE = (errno.ENXIO, errno.ENODEV)
@@ -169,7 +171,7 @@ def open_bus(url: str) -> "Bus":
 class Bus:
     """A bus to send frames on. Trouble on it is survived and counted in `counts`, the last error kept in `error`."""
 
-    __slots__ = ("_bus", "_message", "_sleep", "_socket", "_tries", "counts", "error", "url")
+    __slots__ = ("_bus", "_echoes", "_message", "_sleep", "_socket", "_tries", "counts", "error", "url")
 
     def __init__(self, bus: can.BusABC, url: str, sleep: Callable[[float], None] = time.sleep) -> None:
         self.url = url  # in full, as other processes need it
@@ -178,6 +180,9 @@ class Bus:
         self._bus = bus
         self._sleep = sleep
         self._tries = _TRIES
+        self._echoes: OrderedDict[tuple[int, bytes, bool], int] | None = None
+        if url.startswith("udp_multicast"):
+            self._echoes = OrderedDict()
         self._message = can.Message(is_extended_id=False)
         # python-can's send() costs several times the system call; on a raw socket a frame is 16 bytes
         self._socket: socket.socket | None = bus.socket if isinstance(bus, SocketcanBus) else None
@@ -202,6 +207,8 @@ class Bus:
         message.arbitration_id, message.dlc, message.data = can_id, len(data), bytearray(data)
         message.is_remote_frame = remote
         message.timestamp = time_ns * 1e-9
+        if self._echoes is not None:
+            self._expect_echo(self._echoes, (can_id, bytes(data), remote))
         try:
             self._bus.send(message, timeout=_TRIES * _PAUSE if self._tries > 1 else 0)
         except (can.CanError, OSError) as error:
@@ -249,17 +256,30 @@ class Bus:
 
     def recv(self, timeout: float | None = 0.0) -> Received | None:
         """The next frame, or None if there is none within `timeout` [s] (None: wait for ever) or receiving failed."""
-        try:
-            message = self._bus.recv(timeout)
-        except (can.CanError, OSError) as error:
-            self.error = error
-            self.counts.recv_failed += 1
-            return None
-        if message is None:
-            return None
-        time_ns = round(message.timestamp * 1e9)
-        data = b"" if message.is_remote_frame else bytes(message.data)
-        return Received(message.arbitration_id, data, time_ns, message.is_remote_frame)
+        while True:
+            try:
+                message = self._bus.recv(timeout)
+            except (can.CanError, OSError) as error:
+                self.error = error
+                self.counts.recv_failed += 1
+                return None
+            if message is None:
+                return None
+            data = b"" if message.is_remote_frame else bytes(message.data)
+            key = message.arbitration_id, data, message.is_remote_frame
+            if self._echoes and (count := self._echoes.get(key)):
+                if count == 1:
+                    del self._echoes[key]
+                else:
+                    self._echoes[key] = count - 1
+                continue
+            return Received(message.arbitration_id, data, round(message.timestamp * 1e9), message.is_remote_frame)
+
+    @staticmethod
+    def _expect_echo(echoes: "OrderedDict[tuple[int, bytes, bool], int]", key: tuple[int, bytes, bool]) -> None:
+        echoes[key] = echoes.get(key, 0) + 1
+        if len(echoes) > _ECHOES:  # some did not come back
+            echoes.popitem(last=False)
 
     def fileno(self) -> int:
         """The file descriptor that is readable when there is something to receive. OSError on a virtual bus."""

@@ -1,7 +1,7 @@
 """The bridge at work on a closed torque path: its role, its buses, can.log and the DBC; and what there is to tell of them."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,7 +9,7 @@ from bridge.bus import Bus, listen_command, open_bus
 from bridge.bus_model import BusEventKind
 from bridge.canlog import CanLog
 from bridge.commander import Commander
-from bridge.fit import describe_fit
+from bridge.fit import plan_fit
 from bridge.frame_message import TimedFrame, unpack
 from bridge.on_bus import Rail, on_bus
 from bridge.plan_dbc import dbc_names, plan_dbc
@@ -94,7 +94,8 @@ class ClosedStation:
     def result(self) -> dict[str, Any]:
         """Returns the counts of bridge, buses and log for the summary."""
         robots = self.role.summary()
-        buses = [self._bus_row(number) for number in range(len(self.role.buses))]
+        fit = plan_fit(self.plan)
+        buses = [self._bus_row(number, fit[number].responses_ns) for number in range(len(fit))]
         return {
             "path": "closed",
             "timing": self.plan.can.timing,
@@ -104,7 +105,7 @@ class ClosedStation:
             "log_start": -self.plan.can.bring_up_ns / 1e9,
             "frames": self.frames,
             "load_mean": max(row["load"] for row in buses),
-            "fit": "; ".join(describe_fit(self.plan)),
+            "fit": "; ".join(line.strip() for bus in fit for line in bus.lines),
             "buses": buses,
             "sent": sum(bus.counts.sent for bus in self.buses),
             "failed": sum(bus.counts.failed for bus in self.buses),
@@ -116,8 +117,9 @@ class ClosedStation:
             "robots": robots,
         }
 
-    def _bus_row(self, number: int) -> dict[str, Any]:
-        """Returns what became of the frames on one bus; latencies [s] are from the queue to the end of the frame."""
+    def _bus_row(self, number: int, bounds_ns: Mapping[int, int | None]) -> dict[str, Any]:
+        """Returns what became of the frames on one bus; latencies [s] are from the queue to the end of the frame, and
+        their bounds those of the cyclic frames without errors."""
         model, plan = self.role.buses[number], self.plan.can.buses[number]
         traffic = dict(sorted(model.traffic.items()))
         events = [event for event in model.events if event.kind is not BusEventKind.ERROR]
@@ -137,6 +139,7 @@ class ClosedStation:
                     "destroyed": row.retransmitted,
                     "latency_mean": row.latency_mean_ns / 1e9,
                     "latency_max": row.latency_max_ns / 1e9,
+                    "latency_bound": None if (bound := bounds_ns.get(can_id)) is None else bound / 1e9,
                 }
                 for can_id, row in traffic.items()
             },

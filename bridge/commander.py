@@ -46,7 +46,8 @@ class Torques:
         self.stopped: Counter[str] = Counter()
         self.commands = 0
         self.largest = 0.0
-        self.estop = False
+        self.spoken = False
+        """True once the robot has said something"""
 
     def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
         """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
@@ -58,9 +59,10 @@ class Torques:
             if reason is not None:
                 self.stopped[reason] += 1
             self.largest = max(self.largest, abs(tau_right), abs(tau_left))
-        elif time_ns >= 0:
-            self.stopped[NOT_COMMANDED] += 1
+        else:
             self.envelope.stop(time_ns)
+            self.stopped[NOT_COMMANDED] += self.spoken
+        self.spoken |= heard is not None
         self.commands += time_ns >= 0
         return frames + self.host.command(time_ns, tau_right, tau_left, saturated > 0)
 
@@ -144,6 +146,7 @@ class Commander:
         end_ns = time_ns + self._period_ns
         for bus, master in self._masters.items():
             self._queue(time_ns, bus, master.poll(time_ns))
+        for bus, master in self._masters.items():
             sync = master.sync()
             # It ends with the period, so that all drives sample then.
             self._queue(end_ns - self.buses[bus].duration_ns(sync), bus, [sync])
@@ -156,6 +159,14 @@ class Commander:
             carried.sort(key=lambda timed: timed.time_ns)
         sequence = (time_ns - self._first_ns) // self._period_ns
         return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(carried)),)
+
+    def bus_frames(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
+        """Returns, bus by bus, what is sent once per period whatever robots there are; on a wall clock, at its start."""
+        return [(bus, [master.sync(), *master.poll(time_ns)]) for bus, master in self._masters.items()]
+
+    def reported_since(self, time_ns: int) -> bool:
+        """True if every robot's drives have reported their torques since an instant."""
+        return all(robot.host.torque_ns is not None and robot.host.torque_ns >= time_ns for robot in self.robots)
 
     def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
         send = self.buses[bus].send

@@ -14,7 +14,7 @@ from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
 from bridge.motor import Fault
 from bridge.protocols import DrivePlace, drive_places, make_drive
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
-from echelon.plan import Plan
+from echelon.plan import NEVER_NS, Plan
 from echelon.role import Input, Stage
 
 _SPEED = TORQUE_FIELDS.index("speed_right")
@@ -55,6 +55,10 @@ class DriveBank:
                 self._listeners[placed.place.bus].setdefault(can_id, []).append(placed)
         self._events = [event for event in plan.events if event.kind == "drive_fault"]
         self._on: set[int] = set()
+        self._events_ns = drives.first_ns - 1
+        self._of_robot: list[list[PlacedDrive]] = [[] for _ in plan.robots]
+        for placed in self.drives:
+            self._of_robot[placed.place.robot].append(placed)
         robots = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
         deepest = max(node.depth for node in plan.nodes)
         self.stages = (
@@ -87,11 +91,9 @@ class DriveBank:
     def _serve(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Lets the drives work through what the buses carry until the next report."""
         frames, *robots = heard
-        for placed in self.drives:
-            message = robots[placed.place.robot]
+        for message in robots:
             if message is not None:
-                for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):
-                    motor.set_speed(time_ns, float(message.values[_SPEED + wheel]))
+                self.turn(time_ns, message)
         for timed in unpack(frames.values) if frames is not None else ():
             if timed.node != BRIDGE_NODE:
                 self.drives[timed.node - 1].waiting -= 1
@@ -100,8 +102,55 @@ class DriveBank:
                     placed.take(timed.time_ns, timed.frame)
         return ()
 
+    # On a wall clock, frame by frame:
+
+    @property
+    def due_ns(self) -> int:
+        """When one of the drives next has something to do on its own, or an event is due."""
+        return min([placed.drive.due_ns for placed in self.drives] + [self._next_event_ns])
+
+    @property
+    def turning(self) -> bool:
+        """True if there is torque on some wheel."""
+        return any(motor.torque != 0.0 for placed in self.drives for motor in placed.drive.motors)
+
+    def turn(self, time_ns: int, message: Message) -> None:
+        """Turns the wheels of a robot as it says."""
+        for placed in self._of_robot[message.source]:
+            for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):
+                motor.set_speed(time_ns, float(message.values[_SPEED + wheel]))
+
+    def receive(self, time_ns: int, bus: int, frame: Frame) -> list[TimedFrame]:
+        """Takes a frame from a bus; returns what the drives answer."""
+        for placed in self._listeners[bus].get(frame.can_id, ()):
+            placed.take(time_ns, frame)
+        return self._emptied(time_ns)
+
+    def pass_time(self, time_ns: int) -> list[TimedFrame]:
+        """Lets time pass; returns what the drives send on their own."""
+        if time_ns >= self._next_event_ns:
+            self.apply_events(time_ns)
+        for placed in self.drives:
+            if placed.drive.due_ns <= time_ns:
+                placed.outbox += placed.drive.advance(time_ns)
+        return self._emptied(time_ns)
+
+    def _emptied(self, time_ns: int) -> list[TimedFrame]:
+        said = []
+        for placed in self.drives:
+            if placed.outbox:
+                said += [TimedFrame(time_ns, placed.place.bus, placed.place.node, frame) for frame in placed.outbox]
+                placed.outbox = []
+        return said
+
+    @property
+    def _next_event_ns(self) -> int:
+        times = [at for event in self._events for at in (event.at_ns, event.until_ns)]
+        return min((at for at in times if at > self._events_ns), default=NEVER_NS)
+
     def apply_events(self, time_ns: int) -> None:
         """Makes the scenario's faults happen that are due, and go away."""
+        self._events_ns = time_ns
         for number, event in enumerate(self._events):
             on = event.at_ns <= time_ns < event.until_ns
             if on == (number in self._on):

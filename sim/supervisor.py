@@ -102,7 +102,7 @@ class Supervisor:
                 self._children.append(start(spec))
             self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
             startup_s = time.monotonic() - begun_s
-            start_s = time.monotonic() + (0.0 if self.virtual else WALL_START_S)
+            start_s = time.monotonic() + (0.0 if self.virtual else self._lead_in_s())
             self._tell_all(("start", round(start_s * 1e9)))
             self.progress.phase, self.progress.started_s = "running", start_s
             self._moved_s = time.monotonic()
@@ -128,6 +128,10 @@ class Supervisor:
             self._take_down()
             signal.signal(signal.SIGTERM, previous)
         return self._outcome(failure, startup_s, wall_s)
+
+    def _lead_in_s(self) -> float:
+        """Returns how long after the barrier run time 0 is on a wall clock: drives are brought up until then."""
+        return max(WALL_START_S, self.plan.can.bring_up_ns / 1e9 if self.plan.stations else 0.0)
 
     def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
         """Serves the children until `done`.  Raises RunError if one is lost, the run stalls, or the time is up."""

@@ -34,6 +34,10 @@ def on_wire(frame: Frame) -> str:
     return sent + "1" + "0" + "1" + "1" * 7
 
 
+def key(seed: int, number: int) -> int:
+    return int.from_bytes(hashlib.blake2b(f"{seed}|bus {number}".encode(), digest_size=16).digest(), "little")
+
+
 @dataclass
 class SlowNode:
     capacity: int
@@ -54,7 +58,7 @@ class SlowBus:
     """One bit after the other: nodes that see the bus free start together, and withdraw where their 1 is a 0."""
 
     def __init__(self, seed: int, number: int, capacity: int, restart_bits: int) -> None:
-        self.key = int.from_bytes(hashlib.blake2b(f"{seed}|bus {number}".encode(), digest_size=16).digest(), "little")
+        self.key = key(seed, number)
         self.nodes = {n: SlowNode(capacity) for n in range(4)}
         self.restart_bits = restart_bits
         self.rate = 0.0
@@ -276,7 +280,9 @@ def bits(frame: Frame) -> int:
 
 def test_by_hand() -> None:
     bus = BusTime(500_000)
-    assert bus.due_ns is None
+    assert (bus.due_ns, bus.busy_ns, bus.load) == (None, 0, 0.0)
+    bus.run(-5_000)
+    assert bus.load == 0.0
     assert bus.send(-5_000, 3, C)
     assert bus.due_ns == -5_000 + (bits(C) - 3) * 2_000
     assert bus.send(-5_000, 1, B)  # at the same instant, and more important
@@ -288,6 +294,7 @@ def test_by_hand() -> None:
     ]
     assert bus.run(ends[0] - 1) == []
     assert bus.due_ns == ends[0]
+    assert bus.busy_ns == ends[0] - 1 + 5_000  # so far
     assert bus.run(ends[0]) == [Delivered(-5_000, ends[0], 1, B)]
     assert bus.run(ends[2]) == [Delivered(-4_999, ends[1], 2, A), Delivered(-5_000, ends[2], 3, C)]
     assert bus.run(ends[2] + 6_000) == []
@@ -380,17 +387,45 @@ def test_a_bus_that_is_only_waiting_for_a_node_to_come_back_is_due_by_then() -> 
 
 
 def test_errors_are_a_function_of_seed_bus_and_attempt() -> None:
-    def errors(seed: int, number: int, until: int = 900) -> list[int]:
+    def errors(seed: int, number: int) -> list[int]:
         bus = BusTime(MEGA, seed, number, error_rate=0.2)
-        for n in range(until):
+        for n in range(900):
             bus.send(n * 1_000_000, 1, Frame(n))
         bus.run(10**12)
         return [event.can_id or 0 for event in bus.events if event.kind is BusEventKind.ERROR]
 
-    assert errors(1, 0) == errors(1, 0)
-    assert errors(1, 0)[:20] == errors(1, 0, 400)[:20]
-    assert len({tuple(errors(seed, number)) for seed in (1, 2) for number in (0, 1)}) == 4
-    assert len(errors(1, 0)) == pytest.approx(900 * 0.25, abs=50)  # p/(1 - p) of them, within three sigma
+    def drawn(seed: int, number: int) -> list[int]:
+        chances = Philox(key=key(seed, number)).random_raw(4 * 2000)[::4].tolist()
+        found = []
+        for n in range(900):
+            while chances.pop(0) < 0.2 * 2**64:
+                found.append(n)
+        return found
+
+    cases = [(1, 0), (1, 1), (2, 0)]
+    assert [errors(*case) for case in cases] == [drawn(*case) for case in cases]
+    assert len({tuple(drawn(*case)) for case in cases}) == 3
+
+
+@pytest.mark.parametrize(("errors", "after"), [(1, 0), (126, 125), (127, 126), (128, 119), (135, 119)])
+def test_a_receiver_counts_errors_of_others(errors: int, after: int) -> None:
+    bus = BusTime(MEGA)
+    for node in range(4):
+        bus.send(0, node, Frame(node))
+    bus.run(MEGA)
+    bus.set_error_rate(1.0)
+    for node in (1, 2, 3):
+        bus.send(MEGA, node, Frame(node))
+    while sum(traffic.retransmitted for traffic in bus.traffic.values()) < errors:
+        assert bus.due_ns is not None
+        bus.run(bus.due_ns)
+    assert bus.counters(0) == (0, min(errors, 128))
+    bus.set_error_rate(0.0)
+    while not bus.run(bus.due_ns or 0):
+        pass
+    assert bus.counters(0) == (0, after)
+    kinds = [event.kind for event in bus.events if event.node == 0]
+    assert kinds == ([BusEventKind.PASSIVE, BusEventKind.ACTIVE] if errors >= 128 else [])
 
 
 def test_an_error_costs_between_17_and_23_bits_besides_what_was_sent() -> None:
@@ -452,10 +487,11 @@ def test_ideal_bus() -> None:
     bus = IdealBus()
     for at, node, frame in ((-7, 1, C), (-7, 2, A), (0, 1, B)):
         assert bus.send(at, node, frame)
-    assert (bus.due_ns, bus.duration_ns(A), bus.traffic[0x300].pending) == (-7, 0, 1)
+        assert bus.due_ns == -7
+    assert (bus.duration_ns(A), bus.traffic[0x300].pending) == (0, 1)
     assert bus.run(0) == [Delivered(-7, -7, 1, C), Delivered(-7, -7, 2, A), Delivered(0, 0, 1, B)]
     assert bus.run(5) == []
-    assert [(n.sent, n.delivered, n.lost, n.latency_max_ns) for n in bus.traffic.values()] == [(1, 1, 0, 0)] * 3
+    assert [(n.sent, n.delivered, n.lost, n.latency_mean_ns) for n in bus.traffic.values()] == [(1, 1, 0, 0)] * 3
     assert (bus.busy_ns, bus.load, bus.events) == (0, 0.0, [])
     bus.set_error_rate(0.0)
     with pytest.raises(ValueError, match=r"0, not 0\.5"):

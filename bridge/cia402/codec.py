@@ -154,6 +154,15 @@ TRANSITIONS = {
 }
 """Where a command leads; in a state that is not here with it, it changes nothing."""
 
+
+def next_state(state: State, controlword: int, last: int) -> State:
+    """Where a controlword leads after the one before it.  Where there is no fault to reset, its other bits count."""
+    command = command_of(controlword, last)
+    if command is Command.FAULT_RESET and state is not State.FAULT:
+        command = command_of(controlword & ~_FAULT_RESET_BIT, 0)
+    return TRANSITIONS.get((state, command), state)
+
+
 AUTOMATIC = {
     State.NOT_READY_TO_SWITCH_ON: State.SWITCH_ON_DISABLED,  # 1
     State.QUICK_STOP_ACTIVE: State.SWITCH_ON_DISABLED,  # 12

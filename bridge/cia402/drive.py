@@ -24,17 +24,15 @@ from bridge.cia402.codec import (
     MODE_NONE,
     MODE_PROFILE_TORQUE,
     REMOTE,
-    TRANSITIONS,
     VOLTAGE_ENABLED,
-    Command,
     ErrorCode,
     Nmt,
     State,
     check_node,
-    command_of,
     emergency,
     milliseconds,
     newton_metres,
+    next_state,
     permille,
     rated_mnm,
 )
@@ -202,16 +200,15 @@ class Cia402Drive(Node):
     # the state machine
 
     def _control(self, time_ns: int, word: int) -> None:
-        command = command_of(word, self._controlword)
+        state = next_state(self.state, word, self._controlword)
         self._controlword = self._od[objects.CONTROLWORD] = word
-        if command is Command.FAULT_RESET and self.state is State.FAULT:
+        if self.state is State.FAULT and state is not State.FAULT:
             if self._host_lost or self.motor.causes:
                 self.refused["fault persists"] += 1
                 return
             self._errors.clear()
             self._report(self._errors)
-        state = TRANSITIONS.get((self.state, command))
-        if state is not None:
+        if state is not self.state:
             self._go(time_ns, state)
         if self.state is State.QUICK_STOP_ACTIVE and self._od[objects.QUICK_STOP_OPTION] not in _STAYS:
             self._go(time_ns, AUTOMATIC[self.state])

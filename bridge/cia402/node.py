@@ -381,7 +381,9 @@ class Node(ABC):
                 raise SdoError(Abort.DEVICE_STATE)
             return
         od[key] = value
-        if key == objects.PRODUCER_HEARTBEAT:
+        if key == (objects.ERRORS, 0):
+            od.reset(objects.ERRORS, objects.ERRORS)
+        elif key == objects.PRODUCER_HEARTBEAT:
             self._beat_after(time_ns)
         elif key == objects.CONSUMER_HEARTBEAT:
             self._host_lost = False

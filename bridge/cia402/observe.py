@@ -18,16 +18,15 @@ from bridge.cia402.codec import (
     TPDO2,
     TPDO3,
     TPDO_IDS,
-    TRANSITIONS,
     Nmt,
     NmtCommand,
     State,
     check_node,
-    command_of,
     emergency_of,
     error_text,
     heartbeat_state,
     newton_metres,
+    next_state,
     rated_mnm,
     state_of,
 )
@@ -212,8 +211,7 @@ def _reachable(states: frozenset[State], words: Iterable[tuple[int, int]]) -> fr
     """The states that these may lead to, by themselves or by controlwords, each of which may not have been heard yet."""
     found = _settled(states)
     for word, before in words:
-        command = command_of(word, before)
-        found |= _settled(frozenset(TRANSITIONS[state, command] for state in found if (state, command) in TRANSITIONS))
+        found |= _settled(frozenset(next_state(state, word, before) for state in found))
     return found
 
 

@@ -89,8 +89,10 @@ def test_an_unmodified_master_finds_enables_and_moves_a_drive(network: Any) -> N
         node.state = "QUICK STOP ACTIVE"
         node.state = "OPERATION ENABLED"  # transition 16
         node.state = "SWITCH ON DISABLED"
+        heard: list[int] = []
+        node.nmt.add_heartbeat_callback(heard.append)
         node.nmt.state = "RESET"
-        node.nmt.wait_for_bootup(PATIENCE_S)
+        until(lambda: 0 in heard)
         node.rpdo[2].stop()
         network.sync.stop()
     assert {reason for drive in drives for reason in drive.refused} <= {"not operational"}
@@ -171,7 +173,13 @@ class Slave:
         if self.node.nmt.state != "OPERATIONAL":
             return
         torque = self.get(0x6071) if self.state == "OPERATION ENABLED" else 0
-        values = {0x6041: State402.SW_MASK[self.state][1], 0x6061: self.get(0x6060), 0x6077: torque, 0x6064: 7, 0x606C: 9}
+        values = {
+            0x6041: State402.SW_MASK[self.state][1],
+            0x6061: self.get(0x6060),
+            0x6077: torque,
+            0x6064: 7,
+            0x606C: 9,
+        }
         for number in (1, 2, 3):
             pdo = self.node.tpdo[number]
             for entry in pdo:

@@ -9,9 +9,9 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import can
 import odrive_can
 import pytest
+from can.interfaces.socketcan import SocketcanBus
 from odrive_can.mock import ODriveCANMock
 from odrive_can.odrive import CanMsg, DriveError, ODriveCAN
 
@@ -25,7 +25,7 @@ from tests.bench_drives import MS, Bench, drive_plan
 pytestmark = pytest.mark.vcan
 
 URL = "socketcan:vcan0"
-PLAN = drive_plan("odrive", (1, 2), watchdog_ns=600 * MS)  # the client waits for heartbeats without sending torques
+PLAN = drive_plan("odrive", (1, 2), watchdog_ns=1000 * MS)  # the client waits for heartbeats without sending torques
 DBC = Path(odrive_can.__file__).parent / "dbc" / "odrive-cansimple-0.6.10.dbc"
 LIMIT_S = 20.0
 
@@ -36,8 +36,8 @@ def bench() -> Iterator[Bench]:
         yield running
 
 
-def socketcan() -> can.BusABC:
-    return can.Bus(interface="socketcan", channel="vcan0")
+def socketcan() -> SocketcanBus:
+    return SocketcanBus(channel="vcan0")
 
 
 class Client:
@@ -95,6 +95,7 @@ def test_odrive_can_turns_the_wheel_and_sees_the_watchdog(bench: Bench) -> None:
         # by remote frames, or the cyclic ones that come in between; 0.125 N m/A
         assert await drive.get_iq() == {"Iq_Setpoint": 2.0, "Iq_Measured": 2.0}
         supply = await drive.get_bus_voltage_current()
+        drive.set_input_torque(0.25)
         assert 23.0 < supply["Bus_Voltage"] < 24.0
         assert 0.0 < supply["Bus_Current"] < 1.0
         assert (await drive.get_encoder_estimates())["Vel_Estimate"] > 0.5
@@ -140,7 +141,7 @@ def test_odrive_can_sees_faults_and_emergency_stop(bench: Bench) -> None:
         await drive.wait_for_heartbeat()
         drive.check_errors()
         await drive.set_axis_state("CLOSED_LOOP_CONTROL")
-        await client.push(0.0, lambda: bench.drives[1].motors[0].torque == 0.0)
+        drive.set_input_torque(0.0)
         await client.push(0.25, lambda: client.speed > 0.2)
 
     with_client(test)
@@ -187,6 +188,7 @@ def test_our_host_brings_up_the_packages_mock() -> None:
                 served.cancel()
                 for mock in mocks:
                     mock.notifier.stop()
+                    mock.bus.shutdown()
 
     asyncio.run(run())
     assert told["Axis1_Set_Input_Torque"]["Input_Torque"] == 0.0

@@ -1,0 +1,286 @@
+"""The processes between robots and their wheels on a wall clock: the bridge and the virtual drives, each with its buses.
+
+Both sleep until a frame, a robot's torque or an instant of their own comes.  A torque becomes frames as soon as it has
+come; a robot that says nothing in a period has its last torque sent again, until the envelope finds that too old.
+"""
+
+import os
+import select
+import time
+from array import array
+from collections import deque
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bridge.bus import Bus, open_bus
+from bridge.bus_load import frame_bits
+from bridge.closed import ClosedStation
+from bridge.drive_bank import DriveBank
+from bridge.frame import Frame
+from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
+from echelon.layout import message_size
+from echelon.messages import Channel, Message
+from echelon.plan import Plan
+from echelon.session import Session
+from echelon.wire import WireError, data_key, decode, encode, join, watch_key
+from sim.joining import ProcessSpec, Result, StartError, meet, resources
+
+PROGRESS_NS: Final = 200_000_000
+FEEDBACK_SHARE: Final = 8
+"""Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""
+OTHER_NODE: Final = 1
+"""What frames are noted as that others sent: which of them cannot be told from a frame."""
+
+
+class Mail:
+    """Robots' torques as they come, in Zenoh's thread; `fileno` becomes readable."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._size = message_size(plan, 0, Channel.TORQUE)
+        self._robots = len(plan.robots)
+        self._messages: deque[Message] = deque()
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.refused: dict[str, int] = {}
+
+    def receive(self, payload: bytes) -> None:
+        """Takes a payload."""
+        try:
+            message = decode(payload)
+            if message.channel is not Channel.TORQUE or message.source >= self._robots:
+                raise WireError("of no robot")
+            if message.values.size != self._size:
+                raise WireError("wrong number of values")
+        except WireError as error:
+            self.refused[error.reason] = self.refused.get(error.reason, 0) + 1
+            return
+        self._messages.append(message)
+        os.eventfd_write(self._wake, 1)
+
+    def take(self) -> list[Message]:
+        """Returns what has come."""
+        try:
+            os.eventfd_read(self._wake)
+        except BlockingIOError:
+            return []
+        return [self._messages.popleft() for _ in range(len(self._messages))]
+
+    def fileno(self) -> int:
+        """For select."""
+        return self._wake
+
+
+class WallBridge:
+    """The bridge on a wall clock.  Times are run time, `now` from a clock that starts at 0 with the run."""
+
+    def __init__(self, spec: ProcessSpec, session: Session) -> None:
+        plan = spec.plan
+        self.plan = plan
+        self.station = ClosedStation(plan, spec.can_urls, Path(spec.folder), paired=True)
+        self.mail = Mail(plan)
+        self._role = self.station.role
+        self._period_ns = plan.stations[0].period_ns
+        self._last: list[Message | None] = [None] * len(plan.robots)
+        self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period that a robot's torque was last sent in
+        self._cycle = -plan.can.bring_up_ns // self._period_ns
+        self._told = -1
+        self._frames: list[TimedFrame] = []
+        self._bits = [0] * len(plan.can.buses)
+        self.latencies = array("q")
+        self.in_time = 0
+        session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in plan.robots], self.mail.receive)
+        self._wheels = session.publisher(data_key(spec.run, plan.stations[0].path, Channel.WHEELS))
+        self._watch = session.publisher(watch_key(spec.run, "bridge", "bridge")) if spec.watched else None
+
+    @property
+    def due_ns(self) -> int:
+        """When there is something to do without anything having come."""
+        at_ns = self._cycle * self._period_ns
+        if self._told < self._cycle - 1 and self._cycle > 0:
+            return at_ns - self._period_ns + self._period_ns // FEEDBACK_SHARE
+        return at_ns
+
+    def torques(self, now_ns: int) -> None:
+        """Takes robots' torques and sends them."""
+        for message in self.mail.take():
+            before = self._last[message.source]
+            if before is None or message.sequence > before.sequence:
+                self._last[message.source] = message
+                self._send_robot(now_ns, message.source)
+                latency_ns = now_ns - message.time_ns
+                self.latencies.append(latency_ns)
+                self.in_time += latency_ns < self._period_ns
+
+    def frames(self, now_ns: int) -> None:
+        """Takes what has come from the buses."""
+        for number, bus in enumerate(self.station.buses):
+            while (received := bus.recv(0.0)) is not None:
+                frame = Frame(received.can_id, received.data, received.remote)
+                self._role.receive(now_ns, number, frame)
+                self._note(TimedFrame(now_ns, number, OTHER_NODE, frame))
+
+    def pass_time(self, now_ns: int) -> None:
+        """Does what is due: a new period, and telling robots of the one that ended."""
+        while now_ns >= self._cycle * self._period_ns:
+            for robot in range(len(self._last)):
+                if self._sent_in[robot] < self._cycle - 1:
+                    self._send_robot(now_ns, robot)
+            self._role.apply_events(now_ns)
+            for bus, frames in self._role.bus_frames(now_ns):
+                for frame in frames:
+                    self._put(now_ns, bus, frame)
+            self._flush()
+            self._cycle += 1
+        at = self._cycle - 1
+        if 0 <= at != self._told:
+            begun_ns = at * self._period_ns
+            late = now_ns >= begun_ns + self._period_ns // FEEDBACK_SHARE
+            if late or self._role.reported_since(begun_ns - self._period_ns // 2):
+                self._told = at
+                payload = encode(self._role.wheels(begun_ns))
+                self._wheels.put(payload)
+                if self._watch is not None:
+                    self._watch.put(join([payload]))
+
+    def stop(self, now_ns: int) -> None:
+        """Takes the torque away from all wheels and disables their drives."""
+        for robot in self._role.robots:
+            for frame in robot.host.stop(now_ns):
+                self._put(now_ns, robot.robot.drive.bus, frame)
+        self._flush()
+
+    def frozen(self) -> None:
+        """Keeps how robots stand now: what comes after is their being stopped."""
+        self._robots = self._role.summary()
+
+    def result(self) -> dict[str, Any]:
+        """Returns what there is to say of the bridge; latencies [s] are from a robot's state to its torque frames."""
+        simulated_s = max(1, self._cycle * self._period_ns) / 1e9
+        result = self.station.result()
+        for row, bits in zip(result["buses"], self._bits, strict=True):
+            row["load"] = bits / row["bitrate"] / simulated_s
+        result["load_mean"] = max(row["load"] for row in result["buses"])
+        latencies = np.array(self.latencies) / 1e9
+        result["torque"] = {
+            "periods": len(self._last) * max(0, min(self._cycle, self.plan.duration_ns // self._period_ns + 1)),
+            "came": len(latencies),
+            "in_time": self.in_time,
+            "latency_median": float(np.median(latencies)) if len(latencies) else None,
+            "latency_p99": float(np.percentile(latencies, 99)) if len(latencies) else None,
+            "latency_max": float(latencies.max()) if len(latencies) else None,
+        }
+        result["refused_messages"] = self.mail.refused
+        result["robots"] = self._robots
+        return result
+
+    def _send_robot(self, now_ns: int, robot: int) -> None:
+        torques = self._role.robots[robot]
+        self._sent_in[robot] = self._cycle - 1
+        for frame in torques.frames(now_ns, self._last[robot]):
+            self._put(now_ns, torques.robot.drive.bus, frame)
+
+    def _put(self, now_ns: int, bus: int, frame: Frame) -> None:
+        if self.station.buses[bus].send(frame.can_id, frame.data, remote=frame.remote):
+            self._note(TimedFrame(now_ns, bus, BRIDGE_NODE, frame))
+
+    def _note(self, timed: TimedFrame) -> None:
+        self._frames.append(timed)
+        self._bits[timed.bus] += frame_bits(timed.frame.can_id, timed.frame.data)
+
+    def _flush(self) -> None:
+        """Logs the frames of a period, and shows them to those who watch."""
+        if not self._frames:
+            return
+        self.station.log(self._frames)
+        if self._watch is not None:
+            at_ns = self._frames[-1].time_ns
+            message = Message(Channel.FRAMES, self.station.index, self.station.messages, at_ns, pack(self._frames))
+            self.station.messages += 1
+            self._watch.put(join([encode(message)]))
+        self._frames = []
+
+
+def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    """The bridge process of a run on a wall clock."""
+    try:
+        bridge = WallBridge(spec, session)
+    except (ValueError, OSError) as error:
+        raise StartError(str(error)) from None
+    control.send(("bus", bridge.station.url))
+    start_ns = meet(spec, session, control)
+    said_ns = 0
+
+    def now() -> int:
+        return time.monotonic_ns() - start_ns
+
+    while True:
+        _wait([control, bridge.mail, *_readable(bridge.station.buses)], bridge.due_ns - now())
+        bridge.frames(now())
+        bridge.torques(now())
+        bridge.pass_time(now())
+        if now() - said_ns >= PROGRESS_NS:
+            said_ns = now()
+            control.send(("progress", bridge.station.progress()))
+            if control.poll():
+                control.recv()
+                break
+    bridge.frozen()
+    bridge.stop(now())
+    bridge.frames(now())
+    bridge.station.close()
+    cpu_s, resident = resources()
+    control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))
+    control.recv()
+
+
+def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    """The process of the virtual drives of a run on a wall clock."""
+    try:
+        buses = [open_bus(url) for url in spec.can_urls]
+    except (ValueError, OSError) as error:
+        raise StartError(str(error)) from None
+    bank, mail = DriveBank(spec.plan), Mail(spec.plan)
+    session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in spec.plan.robots], mail.receive)
+    start_ns = meet(spec, session, control)
+    until_ns: int | None = None
+    while until_ns is None or time.monotonic_ns() < until_ns:
+        serve(bank, buses, start_ns, [control, mail])
+        for message in mail.take():
+            bank.turn(time.monotonic_ns() - start_ns, message)
+        if until_ns is None and control.poll():
+            control.recv()
+            # Until the drives stopped by themselves if nobody stopped them.
+            until_ns = time.monotonic_ns() + (2 * spec.plan.can.watchdog_ns if bank.turning else 0)
+    for bus in buses:
+        bus.close()
+    cpu_s, resident = resources()
+    failed = sum(bus.counts.failed + bus.counts.dropped for bus in buses)
+    control.send(("done", Result(spec.name, cpu_s, resident, extra={"robots": bank.summary(), "failed": failed})))
+    control.recv()
+
+
+def serve(bank: DriveBank, buses: Sequence[Bus], start_ns: int, also: Sequence[Any] = ()) -> None:
+    """Waits for what comes next, a frame or an instant of the drives' own, and lets them work; `also` ends the wait too."""
+    _wait([*also, *_readable(buses)], bank.due_ns - (time.monotonic_ns() - start_ns))
+    for number, bus in enumerate(buses):
+        while (received := bus.recv(0.0)) is not None:
+            now_ns = time.monotonic_ns() - start_ns
+            _send(buses, bank.receive(now_ns, number, Frame(received.can_id, received.data, received.remote)))
+    _send(buses, bank.pass_time(time.monotonic_ns() - start_ns))
+
+
+def _send(buses: Sequence[Bus], frames: Sequence[TimedFrame]) -> None:
+    for _, bus, _, (can_id, data, remote) in frames:
+        buses[bus].send(can_id, data, remote=remote)
+
+
+def _wait(sources: Sequence[Any], left_ns: int) -> None:
+    """Sleeps until one of the sources is readable or the time is over."""
+    select.select(sources, (), (), min(max(left_ns, 0), PROGRESS_NS) * 1e-9)
+
+
+def _readable(buses: Sequence[Bus]) -> list[Bus]:
+    return list(buses)

@@ -15,6 +15,7 @@ import fcntl
 import ipaddress
 import os
 import re
+import select
 import socket
 import struct
 import time
@@ -33,6 +34,9 @@ DEFAULT_INTERFACE = "vcan0"
 
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of linux/can.h
 _REMOTE = 0x40000000  # CAN_RTR_FLAG
+_OTHER = 0xA0000000  # CAN_EFF_FLAG, CAN_ERR_FLAG: frames with 29-bit identifiers, and news of the controller
+_STAMP = struct.Struct("@ll")  # struct timespec, what SO_TIMESTAMPNS gives
+_STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)
 _BUFFER = 4 << 20
 _TRIES = 10
 _ECHOES = 1024  # frames sent over multicast that may still be on their way back
@@ -184,7 +188,7 @@ class Bus:
         if url.startswith("udp_multicast"):
             self._echoes = OrderedDict()
         self._message = can.Message(is_extended_id=False)
-        # python-can's send() costs several times the system call; on a raw socket a frame is 16 bytes
+        # python-can's send() and recv() cost several times the system call; on a raw socket a frame is 16 bytes
         self._socket: socket.socket | None = bus.socket if isinstance(bus, SocketcanBus) else None
         _enlarge_buffers(bus)
 
@@ -256,6 +260,8 @@ class Bus:
 
     def recv(self, timeout: float | None = 0.0) -> Received | None:
         """The next frame, or None if there is none within `timeout` [s] (None: wait for ever) or receiving failed."""
+        if self._socket is not None:
+            return self._recv_raw(self._socket, timeout)
         while True:
             try:
                 message = self._bus.recv(timeout)
@@ -274,6 +280,33 @@ class Bus:
                     self._echoes[key] = count - 1
                 continue
             return Received(message.arbitration_id, data, round(message.timestamp * 1e9), message.is_remote_frame)
+
+    def _recv_raw(self, raw: socket.socket, timeout: float | None) -> Received | None:
+        deadline_s = None  # known once there is something to wait for
+        while True:
+            try:
+                frame, stamps, _, _ = raw.recvmsg(_FRAME.size, _STAMP_SPACE, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                if timeout is not None:
+                    now_s = time.monotonic()
+                    deadline_s = now_s + timeout if deadline_s is None else deadline_s
+                    if now_s >= deadline_s:
+                        return None
+                poll = select.poll()
+                poll.register(raw, select.POLLIN)
+                poll.poll(None if deadline_s is None else (deadline_s - now_s) * 1e3)
+                continue
+            except OSError as error:
+                self.error = error
+                self.counts.recv_failed += 1
+                return None
+            can_id, length, data = _FRAME.unpack(frame)
+            remote = can_id & _REMOTE != 0
+            if can_id & _OTHER or length > 8:
+                continue
+            seconds, nanoseconds = _STAMP.unpack(stamps[0][2]) if stamps else (0, time.time_ns())
+            data = b"" if remote else data[:length]
+            return Received(can_id & 0x7FF, data, seconds * 1_000_000_000 + nanoseconds, remote)
 
     @staticmethod
     def _expect_echo(echoes: "OrderedDict[tuple[int, bytes, bool], int]", key: tuple[int, bytes, bool]) -> None:

@@ -10,7 +10,7 @@ from bridge.bus_model import BusEventKind
 from bridge.canlog import CanLog
 from bridge.commander import Commander
 from bridge.fit import plan_fit
-from bridge.frame_message import TimedFrame, unpack
+from bridge.frame_message import BRIDGE_NODE, TimedFrame, unpack
 from bridge.on_bus import Rail, on_bus
 from bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.messages import Message
@@ -44,6 +44,7 @@ class ClosedStation:
         self._paired = paired
         self.frames = 0
         self.messages = 0
+        self._robots: dict[str, Any] = {}
         self.stages: tuple[Stage, ...] = self.role.stages
         if self.buses and paired:
             self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.note)
@@ -67,6 +68,18 @@ class ClosedStation:
         for time_ns, bus, _, (can_id, data, remote) in frames:
             write(time_ns, can_id, data, wall_ns, names[bus], remote)
         self.frames += len(frames)
+
+    def stop_wheels(self, time_ns: int) -> None:
+        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends."""
+        self._robots = self.role.summary()
+        frames = [
+            TimedFrame(time_ns, robot.robot.drive.bus, BRIDGE_NODE, frame)
+            for robot in self.role.robots
+            for frame in robot.host.stop(time_ns)
+        ]
+        for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
+            self.buses[bus].send(can_id, data, time_ns, remote)
+        self.log(frames)
 
     def flush(self) -> None:
         """Hands what is logged to the operating system."""
@@ -92,8 +105,8 @@ class ClosedStation:
         }
 
     def result(self) -> dict[str, Any]:
-        """Returns the counts of bridge, buses and log for the summary."""
-        robots = self.role.summary()
+        """Returns the counts of bridge, buses and log for the summary; robots as they were before `stop_wheels`."""
+        robots = self._robots or self.role.summary()
         fit = plan_fit(self.plan)
         buses = [self._bus_row(number, fit[number].responses_ns) for number in range(len(fit))]
         return {
@@ -105,7 +118,8 @@ class ClosedStation:
             "log_start": -self.plan.can.bring_up_ns / 1e9,
             "frames": self.frames,
             "load_mean": max(row["load"] for row in buses),
-            "fit": "; ".join(line.strip() for bus in fit for line in bus.lines),
+            "fit": "; ".join(bus.lines[0] for bus in fit),
+            "advice": [way for bus in fit for way in bus.advice],
             "buses": buses,
             "sent": sum(bus.counts.sent for bus in self.buses),
             "failed": sum(bus.counts.failed for bus in self.buses),

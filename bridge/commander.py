@@ -36,6 +36,11 @@ def make_bus(plan: Plan, number: int) -> BusTime | IdealBus:
     return BusTime(can.buses[number].bitrate, plan.seed, number, capacity=can.queue, restart_ns=can.restart_ns)
 
 
+def _fresh(message: Heard, time_ns: int) -> list[TimedFrame]:
+    """Returns the frames of a message of this instant; a receiver holds an older one when nothing newer comes."""
+    return [] if message is None or message.time_ns != time_ns else unpack(message.values)
+
+
 class Torques:
     """The way of one robot's torques to its drives: envelope, then host; counts what it stopped, and why."""
 
@@ -61,7 +66,8 @@ class Torques:
             self.largest = max(self.largest, abs(tau_right), abs(tau_left))
         else:
             self.envelope.stop(time_ns)
-            self.stopped[NOT_COMMANDED] += self.spoken
+            if self.spoken or time_ns >= self.robot.drive.watchdog_ns:  # a run begins with nothing said yet
+                self.stopped[NOT_COMMANDED] += 1
         self.spoken |= heard is not None
         self.commands += time_ns >= 0
         return frames + self.host.command(time_ns, tau_right, tau_left, saturated > 0)
@@ -94,6 +100,8 @@ class Commander:
         self.index = bridge.index
         self._first_ns = bridge.first_ns
         self._period_ns = bridge.period_ns
+        self.next_ns = bridge.first_ns
+        """End of the last period that frames were made for"""
         self.robots = [Torques(robot) for robot in plan.robots]
         self.buses: list[BusTime | IdealBus] = [make_bus(plan, number) for number in range(len(plan.can.buses))]
         self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
@@ -121,7 +129,7 @@ class Commander:
     def _hear(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the drives' frames of this instant; returns the torques of all wheels in the period that ends."""
         for message in heard:
-            for at_ns, bus, node, frame in unpack(message.values) if message is not None else ():
+            for at_ns, bus, node, frame in _fresh(message, time_ns):
                 if bus < len(self.buses):
                     self.buses[bus].send(at_ns, node, frame)
                     self.receive(at_ns, bus, frame)
@@ -140,6 +148,7 @@ class Commander:
 
     def _send(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Puts the frames of this cycle on the bus; returns all frames that the buses carry until the next one."""
+        self.next_ns = time_ns + self._period_ns
         self.apply_events(time_ns)
         for robot, message in zip(self.robots, heard, strict=True):
             self._queue(time_ns, robot.robot.drive.bus, robot.frames(time_ns, message))

@@ -94,7 +94,8 @@ class DriveBank:
         for message in robots:
             if message is not None:
                 self.turn(time_ns, message)
-        for timed in unpack(frames.values) if frames is not None else ():
+        # Not those of an instant before, which a receiver holds when nothing newer comes.
+        for timed in unpack(frames.values) if frames is not None and frames.time_ns == time_ns else ():
             if timed.node != BRIDGE_NODE:
                 self.drives[timed.node - 1].waiting -= 1
             elif timed.bus < len(self._listeners):
@@ -117,6 +118,7 @@ class DriveBank:
     def turn(self, time_ns: int, message: Message) -> None:
         """Turns the wheels of a robot as it says."""
         for placed in self._of_robot[message.source]:
+            placed.outbox += placed.drive.advance(time_ns)  # what was due before
             for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):
                 motor.set_speed(time_ns, float(message.values[_SPEED + wheel]))
 

@@ -30,7 +30,9 @@ class Fit:
     def lines(self) -> list[str]:
         """The verdict in one line, and one for each remedy."""
         speed = f"{self.bitrate / 1e6:g} Mbit/s" if self.bitrate >= 1_000_000 else f"{self.bitrate / 1e3:g} kbit/s"
-        what = f"{self.robots} robots, {self.identifiers} cyclic identifiers, {100 * self.load:.3g} % of {speed} at most"
+        what = (
+            f"{self.robots} robots, {self.identifiers} cyclic identifiers, {100 * self.load:.3g} % of {speed} at most"
+        )
         known = [response for response in self.responses_ns.values() if response is not None]
         late = [f"{can_id:#05x}" for can_id, response in self.responses_ns.items() if response is None]
         if self.fits:

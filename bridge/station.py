@@ -11,7 +11,7 @@ from bridge.bridge import Bridge
 from bridge.bus import listen_command, open_bus
 from bridge.bus_load import bus_load
 from bridge.canlog import CanLog
-from bridge.fit import describe_fit
+from bridge.fit import plan_fit
 from bridge.frame_message import BRIDGE_NODE, add_words
 from bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.messages import STATE_FIELDS, Channel, Message
@@ -87,6 +87,7 @@ class Station:
         """Returns the counts of bridge, bus and log, and the load this would be on a real bus, for the summary."""
         bits = self._bridge.bits / self._bridge.frames if self._bridge.frames else 0.0
         robots = self._bridge.summary()
+        fit = plan_fit(self._plan)
         return {
             "url": self.url,
             "path": "mirror",
@@ -97,7 +98,8 @@ class Station:
             "clipped": sum(robot["clipped"] for robot in robots["robots"].values()),
             "load_mean": self._load(),
             "bits_per_frame": bits,
-            "fit": "; ".join(describe_fit(self._plan)) if self._bridge.frames else "",
+            "fit": "; ".join(bus.lines[0] for bus in fit),
+            "advice": [way for bus in fit for way in bus.advice],
             "sent": sum(bus.counts.sent for bus in self._buses),
             "failed": sum(bus.counts.failed for bus in self._buses),
             "dropped": sum(bus.counts.dropped for bus in self._buses),

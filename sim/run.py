@@ -170,6 +170,8 @@ def _in_process(
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
+    if plan.stations:
+        station.stop_wheels(station.role.next_ns)
     if station is not None:
         station.close()
     result = recording.result()

@@ -82,6 +82,8 @@ def run_station(spec: ProcessSpec, session: Session, control: Connection) -> Non
         runner.finish()
         done.set()
         teller.join()
+        if isinstance(station, ClosedStation):
+            station.stop_wheels(station.role.next_ns)
         station.close()
     cpu_s, resident = resources()
     links = tuple(runner.mailbox.counts())

@@ -147,14 +147,8 @@ class WallBridge:
 
     def stop(self, now_ns: int) -> None:
         """Takes the torque away from all wheels and disables their drives."""
-        for robot in self._role.robots:
-            for frame in robot.host.stop(now_ns):
-                self._put(now_ns, robot.robot.drive.bus, frame)
         self._flush()
-
-    def frozen(self) -> None:
-        """Keeps how robots stand now: what comes after is their being stopped."""
-        self._robots = self._role.summary()
+        self.station.stop_wheels(now_ns)
 
     def result(self) -> dict[str, Any]:
         """Returns what there is to say of the bridge; latencies [s] are from a robot's state to its torque frames."""
@@ -173,7 +167,6 @@ class WallBridge:
             "latency_max": float(latencies.max()) if len(latencies) else None,
         }
         result["refused_messages"] = self.mail.refused
-        result["robots"] = self._robots
         return result
 
     def _send_robot(self, now_ns: int, robot: int) -> None:
@@ -227,7 +220,6 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
             if control.poll():
                 control.recv()
                 break
-    bridge.frozen()
     bridge.stop(now())
     bridge.frames(now())
     bridge.station.close()

@@ -72,9 +72,9 @@ class Reception:
 def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
     plan = spec.plan
-    sources = range(
-        len(plan.everyone) if plan.stations else len(plan.members) + bool(spec.can_urls)
-    )  # the bridge's messages come after the members'
+    # The bridge's messages come after the members'; drives say something of their own only where time is virtual.
+    stations = len(plan.stations) if spec.virtual else 1
+    sources = range(len(plan.members) + (stations if plan.stations else bool(spec.can_urls)))
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources)
     try:
         recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)

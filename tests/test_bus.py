@@ -1,6 +1,10 @@
 """Buses that need no privileges, URLs, and a bus that misbehaves."""
 
 import errno
+import socket
+import struct
+import threading
+import time
 import uuid
 from collections.abc import Callable
 from typing import Any
@@ -168,6 +172,62 @@ def test_bytes_on_a_raw_socket() -> None:
         "7e010000020000000102000000000000",
         "01000000080000000001020304050607",
     ]
+    bus.close()
+
+
+def kernel_frame(can_id: int, data: bytes) -> bytes:
+    return struct.pack("=IB3x8s", can_id, len(data), data)
+
+
+def test_receiving_on_a_raw_socket() -> None:
+    bus, _, _ = raw_bus([])
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with ours, theirs:
+        bus._socket = ours
+        assert bus.recv(0.0) is None
+        for can_id in (0x80000123, 0x20000004, 0x40000105, 0x7FF):  # extended, error, remote, plain
+            theirs.send(kernel_frame(can_id, b"0123"))
+        before_ns = time.time_ns()
+        got = [bus.recv(0.0), bus.recv(None), bus.recv(0.0)]
+        assert [frame and (frame.can_id, frame.data, frame.remote) for frame in got] == [
+            (0x105, b"", True),
+            (0x7FF, b"0123", False),
+            None,
+        ]
+        assert got[0] is not None
+        assert before_ns <= got[0].time_ns <= time.time_ns()
+        assert bus.counts.recv_failed == 0
+    bus.close()
+
+
+def test_waiting_on_a_raw_socket_ends_with_a_frame_or_with_the_time() -> None:
+    bus, _, _ = raw_bus([])
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with ours, theirs:
+        bus._socket = ours
+        begun_s = time.monotonic()
+        assert bus.recv(0.05) is None
+        assert time.monotonic() - begun_s >= 0.05
+        only_others = threading.Timer(0.05, lambda: theirs.send(kernel_frame(0x80000001, b"")))
+        only_others.start()
+        assert bus.recv(0.2) is None
+        frame = threading.Timer(0.05, lambda: theirs.send(kernel_frame(1, b"")))
+        frame.start()
+        received = bus.recv(None)
+        assert received is not None
+        assert received.can_id == 1
+        for timer in (only_others, frame):
+            timer.join()
+    bus.close()
+
+
+def test_trouble_while_receiving_on_a_raw_socket_is_counted() -> None:
+    bus, _, _ = raw_bus([])
+    bus._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    bus._socket.close()
+    assert bus.recv(None) is None
+    assert bus.counts.recv_failed == 1
+    assert isinstance(bus.error, OSError)
     bus.close()
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
-from canopen.sdo import SdoAbortedError
-from canopen.sdo import SdoClient as ForeignClient
+from canopen.sdo.client import SdoClient as ForeignClient
+from canopen.sdo.exceptions import SdoAbortedError
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -85,7 +85,7 @@ def test_there_and_back(data: bytes) -> None:
     assert (client.abort, client.data) == (None, data)
 
 
-class Wire(canopen.Network):  # type: ignore[misc]
+class Wire(canopen.Network):
     """The package's network; what it sends is kept, or answered by our server at once."""
 
     def __init__(self, server: SdoServer | None = None) -> None:

@@ -59,7 +59,7 @@ class Cia402Drive(Node):
         self.plan = plan
         self.wheel = wheel
         self.motor = Motor(motor)
-        self.motors = (self.motor,)
+        self.motors: tuple[Motor, ...] = (self.motor,)
         self.state = State.NOT_READY_TO_SWITCH_ON
         self._rated = rated_mnm(motor.rated_torque)
         self._silent = False
@@ -132,6 +132,7 @@ class Cia402Drive(Node):
 
     def _switch_on(self, time_ns: int) -> None:
         self._power_off(time_ns)
+        self.motor.mean_torque(time_ns)
         self._hold = self._hold or bool(self._errors)
         self._errors.clear()
         self._controlword = 0
@@ -186,6 +187,7 @@ class Cia402Drive(Node):
     def _rest(self, time_ns: int) -> None:
         if self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
             self._go(time_ns, State.SWITCH_ON_DISABLED)
+        self.motor.mean_torque(time_ns)  # what comes next is another mean
 
     def _without_host(self, time_ns: int) -> None:
         option = self._od[objects.ABORT_CONNECTION]

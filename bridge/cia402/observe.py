@@ -14,6 +14,7 @@ from bridge.cia402.codec import (
     RPDO_IDS,
     SDO_ANSWER_ID,
     SDO_REQUEST_ID,
+    SYNC_ID,
     TPDO1,
     TPDO2,
     TPDO3,
@@ -72,7 +73,8 @@ class Cia402Observer:
     envelope's by more than half a bit; `transition`: a state to which no transition leads from the last one, with the
     controlwords seen; `enabled without command`: the same for OPERATION ENABLED; `torque while disabled`: reported though
     the drive cannot have been in OPERATION ENABLED since the report before; `torque after silence`: reported though no
-    target torque came for the watchdog and a period; `not operational`: a PDO of or for a drive that said it is not.
+    target torque came for the watchdog before the time it reports of; `not operational`: a PDO of or for a drive that
+    said it is not.
 
     The first statusword is taken as it is, unless the drive's boot-up was seen.  An emergency message is no finding: it
     is what `WheelReading.fault` tells.
@@ -89,7 +91,8 @@ class Cia402Observer:
         self._nodes = dict(zip(nodes, self._drives, strict=True))
         bases = (EMCY_ID, *_LENGTHS, HEARTBEAT_ID)
         self._functions = {base + node: (base, self._nodes[node]) for base in bases for node in nodes}
-        self.identifiers = frozenset((NMT_ID, *self._functions))
+        self.identifiers = frozenset((NMT_ID, SYNC_ID, *self._functions))
+        self._syncs_ns: tuple[int, int] | None = None  # when the last two came
         cyclic = (RPDO_IDS[1], *TPDO_IDS[:3])
         self.cyclic = {base + node: plan.period_ns for node in nodes for base in cyclic}
         beat_ns = heartbeat_ns(plan.period_ns, plan.watchdog_ns)
@@ -101,6 +104,9 @@ class Cia402Observer:
             return []
         if frame.remote:
             said = [("remote", "nobody answers remote frames")]
+        elif frame.can_id == SYNC_ID:
+            said = []
+            self._syncs_ns = (self._syncs_ns[1], time_ns) if self._syncs_ns else (time_ns, time_ns)
         elif frame.can_id == NMT_ID:
             said = self._manage(time_ns, frame.data)
         else:
@@ -202,8 +208,10 @@ class Cia402Observer:
             return
         if drive.state is not None and not drive.live:
             yield "torque while disabled", f"{drive.name}: {torque:g} N m while {drive.state.words}"
+        # what is reported is of the time between the last two SYNCs
+        since_ns = time_ns - self._plan.period_ns if self._syncs_ns is None else self._syncs_ns[0]
         commanded_ns = drive.reading.commanded_ns
-        if commanded_ns is None or time_ns - commanded_ns > self._plan.watchdog_ns + self._plan.period_ns:
+        if commanded_ns is None or since_ns - commanded_ns > self._plan.watchdog_ns:
             yield "torque after silence", f"{drive.name}: {torque:g} N m without a target torque in time"
 
 

@@ -13,6 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bridge.cia402.codec import HOST_NODE, SYNC_ID, Nmt, heartbeat
+from bridge.cia402.drive import Cia402Drive
+from bridge.cia402.host import Cia402Host
 from bridge.frame import Drive, Frame, Host
 from bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
 from bridge.native.drive import NativeDrive
@@ -53,6 +56,12 @@ PROTOCOLS = {
         make=lambda plan: ([ODriveDrive(plan, wheel) for wheel in WHEELS], ODriveHost(plan, 3)),
         resolution=lambda plan: 1e-6,
         feeds=lambda frame: frame.can_id & 31 in (0x07, 0x0E),  # Set_Axis_State, Set_Input_Torque
+    ),
+    "cia402": Protocol(
+        make=lambda plan: ([Cia402Drive(plan, wheel) for wheel in WHEELS], Cia402Host(plan, 3)),
+        resolution=lambda plan: plan.motor.rated_torque * 1e-3,
+        beginning=lambda plan, time_ns: [heartbeat(HOST_NODE, Nmt.OPERATIONAL), Frame(SYNC_ID)],
+        feeds=lambda frame: frame.can_id & 0x780 == 0x300,  # RPDO2
     ),
 }
 

@@ -110,7 +110,10 @@ def test_candump_and_cantools_show_newton_metres(bus: Bus, tmp_path: Path) -> No
     number = r"(-?[0-9.e-]+)"
     for index, line in enumerate(shown):
         step, robot = divmod(index, len(ROBOTS))
-        found = re.search(rf":: (\w+)\(tau_right: {number} Nm, tau_left: {number} Nm, enable: 1, clipped: 0,", line)
+        found = re.search(
+            rf":: (\w+)\(tau_right: {number} Nm, tau_left: {number} Nm, enable_right: 1, enable_left: 1, clear: 0, clipped: 0,",
+            line,
+        )
         assert found is not None, line
         assert found[1] == f"torque_{ROBOTS[robot].replace('/', '_')}"
         right, left = torques(step, robot)

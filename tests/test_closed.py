@@ -1,0 +1,277 @@
+"""The closed torque path in one process: what reaches the plant is what the drives decoded, and nothing else."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.commander import NOT_COMMANDED, Commander
+from bridge.drive_bank import DriveBank
+from bridge.frame_message import BRIDGE_NODE, unpack
+from echelon.messages import Channel, Message
+from echelon.plan import Plan
+from sim.engine import Engine
+from sim.trace import TraceBuilder
+from tests.runs import plan_of
+
+MS = 1_000_000
+PERIOD = 10 * MS
+PROTOCOLS = ("native", "odrive", "cia402")
+SCALE = 0.001
+
+
+def closed(*overrides: str, duration: float = 2) -> Plan:
+    """Returns the lab's plan with a closed torque path."""
+    return plan_of("lab", "can.path=closed", f"duration={duration}", "claims=[]", *overrides)
+
+
+def ran(plan: Plan, sink: Callable[[Message], None] = lambda message: None) -> Engine:
+    """Runs a plan to its end."""
+    engine = Engine(plan, sink)
+    engine.run()
+    return engine
+
+
+def stations(engine: Engine) -> tuple[Commander, DriveBank]:
+    """Returns the bridge and the drives of a run."""
+    bridge, drives = (engine.roles[station.index] for station in engine.plan.stations)
+    assert isinstance(bridge, Commander)
+    assert isinstance(drives, DriveBank)
+    return bridge, drives
+
+
+class Heard:
+    """Keeps what robots wanted, and what their wheels got, by time: arrays (robots, 2)."""
+
+    def __init__(self) -> None:
+        self.wanted: dict[int, dict[int, Any]] = {}
+        self.got: dict[int, Any] = {}
+        self.frames: list[Any] = []
+
+    def __call__(self, message: Message) -> None:
+        if message.channel is Channel.TORQUE:
+            self.wanted.setdefault(message.time_ns, {})[message.source] = message.values[:2].copy()
+        elif message.channel is Channel.WHEELS:
+            self.got[message.time_ns] = message.values.reshape(-1, 2).copy()
+        elif message.channel is Channel.FRAMES:
+            self.frames += [(message.source, timed) for timed in unpack(message.values)]
+
+
+def errors(heard: Heard) -> Any:
+    """Returns how far the wheels' torques of each period are from what was wanted at its beginning."""
+    rows = []
+    for time_ns, wanted in heard.wanted.items():
+        got = heard.got.get(time_ns + PERIOD)
+        if got is not None:
+            rows.append(got - np.array([wanted[robot] for robot in range(len(wanted))]))
+    return np.abs(np.array(rows))
+
+
+class RoundedLimits:
+    """A robot's torque limits that round to what a native frame can say: the other way to get there."""
+
+    def __init__(self, limits: Any) -> None:
+        self._limits = limits
+
+    def apply(self, *arguments: float) -> tuple[float, float, bool]:
+        right, left, limited = self._limits.apply(*arguments)
+        return round(right / SCALE) * SCALE, round(left / SCALE) * SCALE, limited
+
+
+def test_without_lag_and_delay_it_is_the_mirrored_path_with_rounded_torques_bit_for_bit() -> None:
+    traces = []
+    mirrored = plan_of("lab", "duration=5", "claims=[]")
+    for plan in (closed("can.timing=ideal", duration=5), mirrored):
+        builder = TraceBuilder(plan)
+        engine = Engine(plan, builder.add)
+        if plan is mirrored:
+            for role in engine.roles[: len(plan.robots)]:
+                role._limits = RoundedLimits(role._limits)  # type: ignore[attr-defined]
+        engine.run()
+        traces.append(builder.build())
+    for one, other in zip(traces[0].states, traces[1].states, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert traces[0].digest() == traces[1].digest()
+    assert np.abs(traces[0].states[0][:, 10]).max() > 0.05  # there was torque
+
+
+@pytest.mark.parametrize(("protocol", "step"), [("native", SCALE), ("odrive", 1e-7), ("cia402", 1.5e-3)])
+def test_wheels_get_what_was_wanted_within_quantisation(protocol: str, step: float) -> None:
+    heard = Heard()
+    engine = ran(closed("can.timing=ideal", f"robot.drive.protocol={protocol}"), heard)
+    found = errors(heard)
+    assert found.shape == (200, 9, 2)
+    assert found.max() <= step / 2 * (1 + 1e-9)
+    assert found.max() > 0  # the frames did round
+    bridge, _ = stations(engine)
+    for row in bridge.summary().values():
+        assert (row["enabled"], row["fault"], sum(row["stopped"].values()), row["refused"]) == (True, "", 0, {})
+
+
+def test_the_bus_takes_time_and_the_wheels_see_it() -> None:
+    """At 500 kbit/s a command arrives after the frames before it: the mean of a period has a part of the old torque."""
+    heard = Heard()
+    ran(closed(), heard)
+    late = errors(heard)
+    assert late.max() > 2 * SCALE
+    # Frame k of nine ends after k + 1 frame times of 0.24 to 0.25 ms, and in the first the bus may have been busy.
+    for robot in range(9):
+        for time_ns in range(10 * PERIOD, 100 * PERIOD, PERIOD):
+            share = (robot + 1.5) * 0.26e6 / PERIOD
+            step = np.abs(heard.wanted[time_ns][robot] - heard.wanted[time_ns - PERIOD][robot])
+            error = np.abs(heard.got[time_ns + PERIOD][robot] - heard.wanted[time_ns][robot])
+            assert (error <= share * step + 1.01 * SCALE).all()
+
+
+def test_bring_up_is_over_before_the_run_and_without_torque() -> None:
+    for protocol in PROTOCOLS:
+        heard = Heard()
+        engine = ran(closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", duration=0.1), heard)
+        early = [
+            timed for source, timed in heard.frames if source == engine.plan.stations[0].index and timed.time_ns < 0
+        ]
+        assert any(timed.node == BRIDGE_NODE for timed in early)
+        assert any(timed.node != BRIDGE_NODE for timed in early)
+        assert all(robot.host.enabled for robot in stations(engine)[0].robots)
+        assert not heard.got[0].any()
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("dead", ["g1/r1", "g2", "coordinator", "bridge"])
+def test_whoever_dies_wheel_torque_is_zero_within_the_watchdog_time_plus_one_frame(protocol: str, dead: str) -> None:
+    plan = closed(f"robot.drive.protocol={protocol}", "can.timing=ideal")
+    index = next(one.index for one in plan.everyone if one.name == dead)
+    heard = Heard()
+    engine = Engine(plan, heard)
+    dies_ns = 1000 * MS
+    bridge, drives = stations(engine)
+
+    def torque_of(robot: int) -> float:
+        return max(
+            abs(motor.torque) for each in drives.drives if each.place.robot == robot for motor in each.drive.motors
+        )
+
+    hit = {"g1/r1": [0, 1, 2], "g2": [3, 4, 5]}.get(dead, list(range(9)))
+    for time_ns in engine.instants():
+        if time_ns == dies_ns:
+            assert all(torque_of(robot) > 0 for robot in range(9))
+            for channel in Channel:
+                engine._receivers.pop((index, channel), None)
+        if time_ns > dies_ns + plan.can.watchdog_ns + PERIOD:
+            assert all(torque_of(robot) == 0 for robot in hit)
+    # It was held until then, and not taken away by chance.
+    assert np.abs(heard.got[dies_ns + plan.can.watchdog_ns // 2][hit]).max() > 0
+    if dead != "bridge":
+        assert all(bridge.robots[robot].stopped[NOT_COMMANDED] > 0 for robot in hit)
+
+
+def test_a_robot_that_is_not_heard_gets_no_torque() -> None:
+    heard = Heard()
+    rule = 'links=[{source="g1/r1", receiver="bridge", channel="torque", loss=1.0}]'
+    engine = ran(closed(rule), heard)
+    got = np.array([row for time_ns, row in heard.got.items() if time_ns > 100 * MS])
+    assert not got[:, 0].any()
+    assert np.abs(got[:, 1:]).max(axis=(0, 2)).min() > 0.01
+    assert stations(engine)[0].summary()["g1/r1"]["largest"] == 0.0
+
+
+def test_a_torque_older_than_the_watchdog_is_not_sent() -> None:
+    heard = Heard()
+    engine = ran(closed('links=[{source="g1/*", receiver="bridge", channel="torque", delay=0.15}]'), heard)
+    assert not np.array(list(heard.got.values()))[:, :3].any()
+    rows = stations(engine)[0].summary()
+    assert rows["g1/r1"]["stopped"][NOT_COMMANDED] > 150
+    assert not rows["g2/r4"]["stopped"].get(NOT_COMMANDED)
+
+
+FAULTS = ("over_temperature", "encoder_loss", "brown_out")
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_drive_with_a_fault_gives_no_torque_until_it_is_cleared_and_enabled(protocol: str, fault: str) -> None:
+    event = f'events=[{{kind="drive_fault", robot="g1/r1", fault="{fault}", at=0.5, duration=0.3}}]'
+    for recover in (False, True):
+        heard = Heard()
+        more = ["robot.drive.recover_after=0.2"] if recover else []
+        engine = ran(closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", event, *more), heard)
+        first = {time_ns: np.abs(row[0]).max() for time_ns, row in heard.got.items()}
+        assert first[500 * MS] > 0
+        # Of the period that begins at the fault, the torque before the next command may still be there.
+        assert all(tau == 0 for time_ns, tau in first.items() if 530 * MS <= time_ns <= 800 * MS)
+        later = [tau for time_ns, tau in first.items() if time_ns > 1500 * MS]
+        assert bool(max(later) > 0) is recover
+        assert max(np.abs(row[1:]).max() for time_ns, row in heard.got.items() if time_ns > 600 * MS) > 0
+        assert bool(stations(engine)[0].robots[0].host.fault) is not recover
+
+
+def test_stuck_torque_stays_and_a_silent_drive_gives_none() -> None:
+    heard = Heard()
+    ran(
+        closed(
+            'events=[{kind="drive_fault", robot="g1/r1", wheel="right", fault="stuck_torque", at=0.5, duration=0.5},'
+            ' {kind="drive_fault", robot="g2/r4", fault="silent", at=0.5}]'
+        ),
+        heard,
+    )
+    right = [heard.got[time_ns][0, 0] for time_ns in range(530 * MS, 1000 * MS, PERIOD)]
+    assert len(set(right)) == 1
+    assert right[0] != 0
+    assert not any(row[3].any() for time_ns, row in heard.got.items() if time_ns > 620 * MS)
+
+
+def test_an_estop_stops_its_robots_for_as_long_as_it_lasts() -> None:
+    heard = Heard()
+    ran(closed('events=[{kind="estop", robot="g1/*", at=0.5, duration=0.5}]'), heard)
+    got = {time_ns: np.abs(row) for time_ns, row in heard.got.items()}
+    assert not any(row[:3].any() for time_ns, row in got.items() if 520 * MS < time_ns < 1000 * MS)
+    assert any(row[:3].any() for time_ns, row in got.items() if time_ns > 1200 * MS)
+    assert all(row[3:].any() for time_ns, row in got.items() if 520 * MS < time_ns < 1000 * MS)
+
+
+def test_an_overloaded_bus_loses_frames_and_says_so() -> None:
+    engine = ran(closed("can.bitrate=125000", "can.queue=8"))
+    bridge, drives = stations(engine)
+    bus = bridge.buses[0]
+    assert bus.load > 0.98
+    assert bridge.lost.total() + sum(placed.lost for placed in drives.drives) > 100
+    for row in bus.traffic.values():
+        assert row.sent == row.delivered + row.lost + row.pending
+
+
+def test_disturbed_frames_are_sent_again_and_a_controller_that_is_off_comes_back() -> None:
+    heard = Heard()
+    engine = ran(
+        closed(
+            'events=[{kind="error_frames", at=0.2, duration=0.3, rate=0.2}, {kind="bus_off", at=1.0}]',
+            "robot.drive.recover_after=0.05",
+        ),
+        heard,
+    )
+    bridge, _ = stations(engine)
+    bus = bridge.buses[0]
+    assert sum(row.retransmitted for row in bus.traffic.values()) > 50
+    kinds = [event.kind.value for event in bus.events if event.node == BRIDGE_NODE and event.time_ns >= 1000 * MS]
+    assert kinds[:2] == ["bus-off", "recovered"]
+    from_bridge = sorted(timed.time_ns for source, timed in heard.frames if timed.node == BRIDGE_NODE)
+    gap = np.diff(from_bridge).max()
+    assert 100 * MS < gap < 115 * MS  # can.restart, 128 times 11 bits, and the way to the next period
+    assert heard.got[1900 * MS].any(axis=1).all()  # all were enabled again
+
+
+def test_one_seed_one_run() -> None:
+    def digest(*overrides: str) -> tuple[str, int]:
+        builder, frames = TraceBuilder(plan := closed(*overrides)), []
+        ran(
+            plan,
+            lambda message: (
+                (builder.add(message), message.channel is Channel.FRAMES and frames.append(message.values.tobytes()))
+                and None
+            ),
+        )
+        return builder.build().digest(), hash(tuple(frames))
+
+    noisy: Sequence[str] = ['events=[{kind="error_frames", at=0, rate=0.05}]', 'links=[{channel="torque", loss=0.2}]']
+    assert digest(*noisy) == digest(*noisy)
+    assert digest(*noisy) != digest(*noisy, "seed=2")

@@ -16,9 +16,10 @@ What protocols ask for, their observers check (bridge.<protocol>.observe).  The 
 
 When a frame is due.  A frame waits while others have the bus, and a full bus breaks no contract.  So a frame is only late
 by the time that the bus was free while it was due: from then to the beginning of the stretch of frames, one right after
-the other, that it is part of.  That beginning, or when it was due if that is later, is what the next period counts from.
-A frame that is missing shifts all later ones by a period, which shows as soon as the bus is free for a moment.  Pauses
-shorter than a frame and an error frame count as busy, for destroyed frames are not seen.  Where a sender was held up it
+the other, that it is part of.  The next is due a period after this one was, or after that beginning if this one was late.
+A frame that is missing shifts all later ones by a period.  On a busy bus only a part of that can be told from waiting, so
+five frames in a row that are late by 2 ms and an eighth of the period are a gap, too; nothing can be told of a bus that is
+never free for so long.  Pauses shorter than a frame and an error frame count as busy, for destroyed frames are not seen.  Where a sender was held up it
 may send what it owes right away: one frame for each period of the delay, before one comes at its time, is no burst.  A
 remote frame asks for one more as well.  While drives are brought up periods do not count.
 
@@ -47,6 +48,9 @@ KEPT: Final = 100
 """Findings that the summary tells in full"""
 SCAN_NS: Final = 50_000_000
 """How often it is looked for identifiers that are silent"""
+SHIFT_NS: Final = 2_000_000
+SHIFTED: Final = 5
+"""So many frames in a row that are later than this, and than an eighth of their period, are a gap, too"""
 BOOT_UP: Final = b"\0"
 _ERROR_BITS: Final = 23
 """Of the longest error frame and the pause after it"""
@@ -221,7 +225,7 @@ class _Lane:
         """Takes note of CANopen drives."""
         for node in nodes:
             own = [base + node for base in (*TPDO_IDS, HEARTBEAT_ID)]
-            self.boot_ups[HEARTBEAT_ID + node] = [self.watches[can_id] for can_id in own]
+            self.boot_ups[HEARTBEAT_ID + node] = [self.watches[can_id] for can_id in own if can_id in self.watches]
 
     @property
     def first_ns(self) -> int | None:
@@ -242,6 +246,8 @@ class _Watch:
         "_last_ns",
         "_longest_ns",
         "_owed",
+        "_shift_ns",
+        "_shifted",
         "_shortest_ns",
         "_squares",
         "_sum",
@@ -268,6 +274,7 @@ class _Watch:
         self.due_ns: int | None = None
         self.silent = False  # which was told
         self._owed = 0
+        self._shifted = self._shift_ns = 0  # how many frames in a row were late, by how much at least
         self._last_ns: int | None = None  # in the run
         self._gaps = self._sum = self._squares = 0  # of distances, less the first one's
         self._first_gap_ns = self._shortest_ns = self._longest_ns = 0
@@ -301,12 +308,33 @@ class _Watch:
                 self._owed -= 1
                 return None
             return "burst", f"{(self.due_ns - begin_ns) / 1e6:.4g} ms before it was due"
-        told = None
         if late_ns > (self.half_ns if tolerance_ns is None else tolerance_ns):
-            told = "gap", f"{late_ns / 1e6:.4g} ms late, its period is {self.period_ns / 1e6:g} ms"
+            told = self._late(late_ns)
+            self.due_ns = busy_ns
+        else:
+            told = self._follow(begin_ns - self.due_ns, late_ns, tolerance_ns)
         self._owed = max(1, round(late_ns / self.period_ns)) if late_ns > self.half_ns else 0
-        self.due_ns = min(max(self.due_ns, busy_ns), begin_ns) + self.period_ns
+        self.due_ns = min(self.due_ns, begin_ns) + self.period_ns
         return told
+
+    def _follow(self, after_ns: int, late_ns: int, tolerance_ns: int | None) -> tuple[str, str] | None:
+        """Keeps `due_ns` with a sender whose clock is a little slower; says if the last frames were all late."""
+        assert self.due_ns is not None
+        shift_ns = max(self.period_ns // 8, SHIFT_NS, tolerance_ns or 0)
+        if after_ns <= shift_ns:
+            self._shifted = 0
+            self.due_ns += max(0, late_ns) // 8
+        elif late_ns > shift_ns:  # and not within a stretch, where nobody can tell
+            self._shifted += 1
+            self._shift_ns = late_ns if self._shifted == 1 else min(late_ns, self._shift_ns)
+            if self._shifted == SHIFTED:
+                self._shifted = 0
+                self.due_ns += self._shift_ns
+                return self._late(self._shift_ns, f", like those before it: {SHIFTED} in a row")
+        return None
+
+    def _late(self, late_ns: int, more: str = "") -> tuple[str, str]:
+        return "gap", f"{late_ns / 1e6:.4g} ms late, its period is {self.period_ns / 1e6:g} ms{more}"
 
     def forget(self) -> None:
         """Its sender begins anew."""

@@ -1,18 +1,21 @@
-"""The bridge: wheel torques in, CAN frames out, and what there is to know about them. Pure: no bus, no clock.
+"""The bridge where torque is mirrored: wheel torques in, CAN frames out, and what there is to know about them. Pure.
 
 Each robot sends its torques once per acceleration period, and each becomes one frame at once; nothing is held back, so
 torques in the order (time, robot) give frames in that order. What must not reach a wheel becomes a frame with zero
-torque that does not enable, so that the drives stop instead of holding the torque before.
+torque that does not enable, so that the drives stop instead of holding the torque before. So does what the envelope
+does not let pass.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from bridge.bus_load import many_frame_bits
+from bridge.bus_load import frame_bits, many_frame_bits
+from bridge.envelope import Envelope
 from bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
+from echelon.plan import EnvelopePlan
 
 _BLOCK = 1024
 
@@ -34,7 +37,7 @@ class RobotCounts:
     """What the bridge saw of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
 
     frames: int = 0
-    stopped: dict[Stop, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
+    stopped: dict[StrEnum, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
     repeated: int = 0  # torques for a period that had its frame: no frame
     skipped: int = 0  # periods without torques between two that had them
     clipped: int = 0  # frames in which a torque was cut to the range of the frame
@@ -45,15 +48,34 @@ class RobotCounts:
 
 
 class Bridge:
-    """Turns torques into native frames.
+    """Turns torques into frames: native ones, or those of another protocol.
 
-    Parameters: the robots' path names in the order of their numbers, the torque scale [N m per bit], and the
-    acceleration period [ns]. Raises ValueError for more robots than identifiers, or a scale or period that is not
-    positive."""
+    Parameters: the robots' path names in the order of their numbers, the torque scale [N m per bit], the acceleration
+    period [ns], the robots' envelopes (none: no limits), and how torques become frames where they are not native, by
+    robot. Raises ValueError for more robots than identifiers, or a scale or period that is not positive."""
 
-    __slots__ = ("_bits", "_codec", "_counters", "_names", "_period_ns", "_sent_data", "_sent_ids", "counts", "frames")
+    __slots__ = (
+        "_bits",
+        "_codec",
+        "_counters",
+        "_envelopes",
+        "_makers",
+        "_names",
+        "_period_ns",
+        "_sent_data",
+        "_sent_ids",
+        "counts",
+        "frames",
+    )
 
-    def __init__(self, robots: Sequence[str], torque_scale: float, period_ns: int | Sequence[int]) -> None:
+    def __init__(
+        self,
+        robots: Sequence[str],
+        torque_scale: float,
+        period_ns: int | Sequence[int],
+        envelopes: Sequence[EnvelopePlan] = (),
+        makers: Mapping[int, Callable[[float, float], list[Frame]]] | None = None,
+    ) -> None:
         if len(robots) > MAX_ROBOTS:
             raise ValueError(f"a bus has identifiers for {MAX_ROBOTS} robots, not {len(robots)}")
         periods = [period_ns] * len(robots) if isinstance(period_ns, int) else list(period_ns)
@@ -63,6 +85,8 @@ class Bridge:
         self._names = tuple(robots)
         self._period_ns = periods
         self._counters = [0] * len(robots)
+        self._envelopes = [Envelope(plan) for plan in envelopes]
+        self._makers = makers or {}
         self.counts = [RobotCounts() for _ in robots]
         self.frames = 0
         self._bits = 0
@@ -93,15 +117,25 @@ class Bridge:
             counts.smallest = min(tau_right, low_right), min(tau_left, low_left)
         if tau_right > high_right or tau_left > high_left:
             counts.largest = max(tau_right, high_right), max(tau_left, high_left)
+        if self._envelopes:
+            tau_right, tau_left, reason = self._envelopes[robot].check(time_ns, time_ns, tau_right, tau_left)
+            if reason is not None:
+                return self.stop(robot, reason)
+        counts.saturated += saturated
+        if robot in self._makers:
+            return self._send_made(robot, self._makers[robot](tau_right, tau_left))
         data, clipped = self._codec.encode(robot, tau_right, tau_left, self._counters[robot], saturated=saturated)
         counts.clipped += clipped > 0
-        counts.saturated += saturated
         return self._send(robot, data)
 
-    def stop(self, robot: int, why: Stop = Stop.REQUESTED) -> list[Frame]:
+    def stop(self, robot: int, why: StrEnum = Stop.REQUESTED) -> list[Frame]:
         """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
         counts = self.counts[robot]
         counts.stopped[why] = counts.stopped.get(why, 0) + 1
+        if self._envelopes and counts.last_ns is not None:
+            self._envelopes[robot].stop(counts.last_ns)
+        if robot in self._makers:
+            return self._send_made(robot, self._makers[robot](0.0, 0.0))
         data, _ = self._codec.encode(robot, 0.0, 0.0, self._counters[robot], enable=(False, False))
         return self._send(robot, data)
 
@@ -115,6 +149,12 @@ class Bridge:
         if len(self._sent_ids) >= _BLOCK:
             self._count_bits()
         return [(can_id, data)]
+
+    def _send_made(self, robot: int, frames: list[Frame]) -> list[Frame]:
+        self.counts[robot].frames += len(frames)
+        self.frames += len(frames)
+        self._bits += sum(frame_bits(can_id, data) for can_id, data in frames)
+        return frames
 
     @property
     def bits(self) -> int:

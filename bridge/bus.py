@@ -57,11 +57,12 @@ class Received(NamedTuple):
 @dataclass(slots=True)
 class BusCounts:
     """What became of the frames: accepted by the bus; refused by it (interface down or gone); given up because its
-    queue stayed full. `recv_failed` counts errors while receiving."""
+    queue stayed full. `received` counts those that came, `recv_failed` errors while receiving."""
 
     sent: int = 0
     failed: int = 0
     dropped: int = 0
+    received: int = 0
     recv_failed: int = 0
 
 
@@ -279,6 +280,7 @@ class Bus:
                 else:
                     self._echoes[key] = count - 1
                 continue
+            self.counts.received += 1
             return Received(message.arbitration_id, data, round(message.timestamp * 1e9), message.is_remote_frame)
 
     def _recv_raw(self, raw: socket.socket, timeout: float | None) -> Received | None:
@@ -306,6 +308,7 @@ class Bus:
                 continue
             seconds, nanoseconds = _STAMP.unpack(stamps[0][2]) if stamps else (0, time.time_ns())
             data = b"" if remote else data[:length]
+            self.counts.received += 1
             return Received(can_id & 0x7FF, data, seconds * 1_000_000_000 + nanoseconds, remote)
 
     @staticmethod

@@ -118,7 +118,7 @@ class ClosedStation:
             "log_start": -self.plan.can.bring_up_ns / 1e9,
             "frames": self.frames,
             "load_mean": max(row["load"] for row in buses),
-            "fit": "; ".join(bus.lines[0] for bus in fit),
+            "fit": fit[0].lines[0] if len(fit) == 1 else [bus.lines[0] for bus in fit],
             "advice": [way for bus in fit for way in bus.advice],
             "buses": buses,
             "sent": sum(bus.counts.sent for bus in self.buses),

@@ -1,5 +1,6 @@
 """The drive protocols by their names in a scenario: which host, drives, observer and DBC messages go with each."""
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final, NamedTuple
 
@@ -51,6 +52,24 @@ def make_observer(robot: RobotPlan) -> Observer:
     """Returns what listens to a robot's frames."""
     observer: Observer = _part(robot.drive.protocol, "observe", "Observer")(robot.drive, robot.envelope, robot.index)
     return observer
+
+
+def torque_frames(robot: RobotPlan) -> Callable[[float, float], list[tuple[int, bytes]]]:
+    """Returns what makes the frames of torques [N m], right and left, of a robot whose drives are not native: those
+    alone, as the mirrored path shows them."""
+    motor, (right, left) = robot.drive.motor, robot.drive.node_ids
+    if robot.drive.protocol == "odrive":
+        from bridge.odrive.codec import MESSAGES, frame_id
+        from bridge.odrive.enums import Command
+
+        torque, command = MESSAGES[Command.SET_INPUT_TORQUE], Command.SET_INPUT_TORQUE
+        ids = frame_id(right, command), frame_id(left, command)
+        return lambda *taus: [(can_id, torque.encode(tau)) for can_id, tau in zip(ids, taus, strict=True)]
+    from bridge.cia402.codec import RPDO2, RPDO_IDS, permille, rated_mnm
+
+    rated = rated_mnm(motor.rated_torque)
+    ids = RPDO_IDS[1] + right, RPDO_IDS[1] + left
+    return lambda *taus: [(can_id, RPDO2.pack(permille(tau, rated))) for can_id, tau in zip(ids, taus, strict=True)]
 
 
 def dbc_messages(drive: DrivePlan, robot: str, number: int) -> list[Any]:

@@ -14,6 +14,7 @@ from bridge.canlog import CanLog
 from bridge.fit import plan_fit
 from bridge.frame_message import BRIDGE_NODE, add_words
 from bridge.plan_dbc import dbc_names, plan_dbc
+from bridge.protocols import torque_frames
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
@@ -31,7 +32,13 @@ class Station:
     def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
         robots = [robot.path for robot in plan.robots]
         self._plan = plan
-        self._bridge = Bridge(robots, plan.can.torque_scale, [robot.period_ns for robot in plan.robots])
+        self._bridge = Bridge(
+            robots,
+            plan.can.torque_scale,
+            [robot.period_ns for robot in plan.robots],
+            [robot.envelope for robot in plan.robots],
+            {robot.index: torque_frames(robot) for robot in plan.robots if robot.drive.protocol != "native"},
+        )
         self._buses = [open_bus(url) for url in urls]
         self.url = ", ".join(bus.url for bus in self._buses)
         for number, name in enumerate(dbc_names(plan)):
@@ -98,7 +105,7 @@ class Station:
             "clipped": sum(robot["clipped"] for robot in robots["robots"].values()),
             "load_mean": self._load(),
             "bits_per_frame": bits,
-            "fit": "; ".join(bus.lines[0] for bus in fit),
+            "fit": fit[0].lines[0] if len(fit) == 1 else [bus.lines[0] for bus in fit],
             "advice": [way for bus in fit for way in bus.advice],
             "sent": sum(bus.counts.sent for bus in self._buses),
             "failed": sum(bus.counts.failed for bus in self._buses),

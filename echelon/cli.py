@@ -39,14 +39,24 @@ def parser() -> argparse.ArgumentParser:
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".")
 
-    def scenario(command: argparse.ArgumentParser) -> None:
-        command.add_argument("scenario", help="a TOML file, or the name of a shipped scenario (paper, lab, …)")
+    def scenario(command: argparse.ArgumentParser, optional: bool = False) -> None:
+        command.add_argument(
+            "scenario",
+            nargs="?" if optional else None,
+            help="a TOML file, or the name of a shipped scenario (paper, lab, …)",
+        )
         command.add_argument(
             "--set",
             action="append",
             metavar="KEY=VALUE",
             help="override a value, e.g. law.epsilon=[0.1,0.2]; repeatable",
         )
+
+    def listening(command: argparse.ArgumentParser) -> None:
+        scenario(command)
+        command.add_argument("--can", metavar="URL", help="where to listen; of several buses all, with commas between")
+        command.add_argument("--seconds", type=float, metavar="S", help="end after so long (default: at Ctrl-C)")
+        command.add_argument("--json", action="store_true", help="print JSON")
 
     run = add("run", "run a scenario; leaves a folder with recording, summary and report")
     scenario(run)
@@ -102,6 +112,27 @@ def parser() -> argparse.ArgumentParser:
     dbc = add("dbc", "print the DBC of a scenario's drives, for cantools, SavvyCAN and the like")
     scenario(dbc)
     dbc.add_argument("--bus", metavar="NAME", help="which of the scenario's buses, if it has several")
+
+    drives = add("drives", "run the virtual drives of a scenario alone, on a bus in real time, to try hosts on")
+    scenario(drives)
+    drives.add_argument("--can", metavar="URL", help="socketcan:vcan0, udp_multicast:<group>:<port>, or auto")
+    drives.add_argument("--seconds", type=float, metavar="S", help="end after so long (default: with Ctrl-C)")
+
+    doctor = add("doctor", "say what this machine can do, and whether a scenario fits it")
+    scenario(doctor, optional=True)
+    doctor.add_argument("--json", action="store_true", help="print the findings as JSON")
+
+    can = add("can", "show what is on a scenario's CAN buses, wheel by wheel; or what was, at the end of a run")
+    listening(can)
+    can.add_argument("--speed", type=float, metavar="X", help="replay a run's can.log, X times as fast as it was")
+
+    referee = add(
+        "referee", "listen to a scenario's CAN buses, or read a run's can.log, and say what breaks the contract"
+    )
+    listening(referee)
+    referee.add_argument(
+        "--tolerance", type=float, metavar="S", help="how late a cyclic frame may be, live (default: half its period)"
+    )
     return top
 
 

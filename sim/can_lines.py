@@ -17,7 +17,12 @@ def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
         facts += [f"{number} {what}" for what, number in _bus_counts(can).items() if number]
     else:
         facts.append(f"{can.get('clipped', 0)} clipped")
-    yield f"  CAN      {', '.join(facts)}; {can.get('fit', '')}"
+    fit = can.get("fit", "")
+    if isinstance(fit, str):
+        yield f"  CAN      {', '.join(facts)}; {fit}"
+    else:
+        yield f"  CAN      {', '.join(facts)}"
+        yield from (f"  bus      {line}" for line in fit)
     if stopped := stopped_by_reason(can):
         reasons = ", ".join(f"{number} {reason}" for reason, number in stopped.most_common(SHOWN))
         yield f"  stopped  torques that became zero before the bus: {reasons}"

@@ -268,6 +268,37 @@ def dbc(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def drives(arguments: argparse.Namespace) -> int:
+    """`echelon drives`"""
+    from sim.drives_command import run_drives
+
+    arguments.set = [*(arguments.set or ()), "can.path=closed", "can.virtual_drives=true"]
+    _, plan = scenario_of(arguments)
+    urls = _bus_urls(plan, arguments.can, False)
+    if not urls or any(url.startswith("virtual") for url in urls):
+        raise UsageError("drives without a bus to others: give --can socketcan:vcan0, udp_multicast: or auto")
+    try:
+        run_drives(plan, urls, arguments.seconds, lambda line: print(line, flush=True))
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from None
+    return 0
+
+
+def doctor(arguments: argparse.Namespace) -> int:
+    """`echelon doctor`"""
+    from dataclasses import asdict
+
+    from sim.doctor import examine, text
+
+    plan = scenario_of(arguments)[1] if arguments.scenario else None
+    findings = examine(plan)
+    if arguments.json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        print(text(findings))
+    return 1 if any(finding.state == "problem" for finding in findings) else 0
+
+
 def analyse(arguments: argparse.Namespace) -> int:
     """`echelon analyse`"""
     from controller.law import BlockGains
@@ -308,3 +339,17 @@ def analyse(arguments: argparse.Namespace) -> int:
     for k, radius in radii.items():
         print(f"    {k} ticks: spectral radius {radius:.6f}, {'settles' if radius < 1 else 'does not settle'}")
     return 0
+
+
+def can(arguments: argparse.Namespace) -> int:
+    """`echelon can`"""
+    from sim import can_commands
+
+    return can_commands.can(arguments)
+
+
+def referee(arguments: argparse.Namespace) -> int:
+    """`echelon referee`"""
+    from sim import can_commands
+
+    return can_commands.referee(arguments)

@@ -112,6 +112,7 @@ def test_frames_arrive_whole_and_in_order(kind: str) -> None:
         if kind == "virtual":
             assert [frame and frame.time_ns for frame in got] == [number * 1_000_000 for number in range(len(FRAMES))]
         assert (sender.counts.sent, sender.counts.failed, sender.counts.dropped) == (len(FRAMES), 0, 0)
+        assert (receiver.counts.received, receiver.counts.recv_failed, sender.counts.received) == (len(FRAMES), 0, 0)
 
 
 def test_a_receiver_keeps_earlier_frames_when_later_ones_are_sent() -> None:
@@ -196,7 +197,7 @@ def test_receiving_on_a_raw_socket() -> None:
         ]
         assert got[0] is not None
         assert before_ns <= got[0].time_ns <= time.time_ns()
-        assert bus.counts.recv_failed == 0
+        assert (bus.counts.received, bus.counts.recv_failed) == (2, 0)
     bus.close()
 
 

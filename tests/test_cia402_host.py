@@ -227,6 +227,22 @@ def test_a_controlword_that_was_lost_is_sent_again() -> None:
     assert len(lost) == 3
 
 
+def test_no_drive_is_enabled_in_another_mode() -> None:
+    rig = Rig(plan_of())
+    words: list[int] = []
+    rig.listen = lambda time_ns, frame: words.append(frame.data[0]) if frame.can_id == 0x205 else None
+    rig.lose = lambda frame: frame.can_id in (0x185, 0x205)  # the right drive's part is played here
+    rig.cycles(42)
+    for word, mode, cycles in ((0x40, 4, 1), (0x21, 4, 1), (0x23, 4, 20), (0x23, 10, 1)):
+        rig.host.receive(rig.time_ns, Frame(0x185, struct.pack("<Hb", word, mode)))
+        rig.cycles(cycles)
+    assert words == [6, 7, *[7] * 4, 15]  # again after each five periods
+    rig.host.receive(rig.time_ns, Frame(0x185, struct.pack("<Hb", 0x27, 4)))
+    assert not rig.host.enabled
+    rig.host.receive(rig.time_ns, Frame(0x185, struct.pack("<Hb", 0x27, 10)))
+    assert rig.host.enabled
+
+
 def test_stop_and_start() -> None:
     rig = Rig(plan_of()).bring_up()
     rig.cycles(3, 0.5, 0.5)

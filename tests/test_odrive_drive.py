@@ -159,6 +159,7 @@ def test_other_modes_cannot_be_had(control: int, entry: int) -> None:
     assert heartbeat(drive, 0) == ("NONE", "IDLE", "INVALID_STATE")
     assert drive.refused == {"controller mode": 1, "state without torque control": 1}
     enable(drive, 0)
+    assert heartbeat(drive, 0) == ("NONE", "CLOSED_LOOP_CONTROL", "SUCCESS")
     torque(drive, 0, 0.5)
     send(drive, 0, "Set_Controller_Mode", Control_Mode=control, Input_Mode=entry)
     assert (drive.state, drive.motor.torque) == (AxisState.CLOSED_LOOP_CONTROL, 0.5)

@@ -148,7 +148,7 @@ def test_last_words_of_a_process_that_fails(tmp_path: Path) -> None:
     outcome = supervised(plan_of("paper", SHORT), tmp_path, order=spoil)
     assert outcome.failure is not None
     assert outcome.failure.startswith("lost leader g3 (exit code 1)")
-    assert "StopIteration" in outcome.failure
+    assert "IndexError" in outcome.failure
 
 
 def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None:

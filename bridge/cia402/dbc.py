@@ -28,7 +28,8 @@ from bridge.cia402.codec import (
     Nmt,
     rated_mnm,
 )
-from bridge.cia402.host import WHEELS, heartbeat_ns
+from bridge.cia402.configuration import heartbeat_ns
+from bridge.cia402.host import WHEELS
 from echelon.plan import DrivePlan
 
 Choices = OrderedDict[int, str | NamedSignalValue]

@@ -5,7 +5,6 @@
 - Whatever comes is checked; what is refused is counted by reason.
 """
 
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
 
@@ -27,6 +26,7 @@ from bridge.cia402.codec import (
 )
 from bridge.cia402.objects import Dictionary
 from bridge.cia402.pdo import COMMUNICATION, MAPPING, Pdo, check_change, pack, pdos
+from bridge.cia402.profile import Profile
 from bridge.cia402.sdo import LENGTH, Abort, Key, SdoError, SdoServer, abort_code
 from bridge.frame import Frame
 from echelon.plan import NEVER_NS
@@ -36,7 +36,7 @@ _STATES = (objects.STATUSWORD, objects.MODE_DISPLAY, objects.ERROR_CODE, objects
 """A change of these sends a TPDO that goes by itself."""
 
 
-class Node(ABC):
+class Node(Profile):
     """A node with this id; `values` are those of objects that have no default."""
 
     def __init__(self, node: int, values: Mapping[Key, int]) -> None:
@@ -57,48 +57,6 @@ class Node(ABC):
         """When TPDOs were last sent, and what it was that makes them go by themselves."""
         self._host_lost = False
         self._configure()
-
-    # what the profile does
-
-    @abstractmethod
-    def _switch_on(self, time_ns: int) -> None:
-        """Begins as after power-on; objects have their first values again."""
-
-    @abstractmethod
-    def _booted(self, time_ns: int) -> None:
-        """The boot-up message is sent."""
-
-    @abstractmethod
-    def _physics(self, time_ns: int) -> None:
-        """Lets the device's own time pass."""
-
-    @abstractmethod
-    def _sample(self, time_ns: int, key: Key) -> int:
-        """The value of an object for a TPDO."""
-
-    @abstractmethod
-    def _allowed(self, key: Key, value: int) -> bool:
-        """Whether an object of the profile may ever have a value, besides its limits."""
-
-    @abstractmethod
-    def _set(self, time_ns: int, key: Key, value: int) -> bool:
-        """Gives an object of the profile an allowed value, with all that follows; false if it is refused now."""
-
-    @abstractmethod
-    def _took(self, time_ns: int, pdo: Pdo) -> None:
-        """An RPDO was taken."""
-
-    @abstractmethod
-    def _missed(self, time_ns: int) -> None:
-        """An RPDO did not come in time."""
-
-    @abstractmethod
-    def _rest(self, time_ns: int) -> None:
-        """The node is no longer operational."""
-
-    @abstractmethod
-    def _without_host(self, time_ns: int) -> None:
-        """The host's heartbeat is lost."""
 
     # time
 

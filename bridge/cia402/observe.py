@@ -31,7 +31,8 @@ from bridge.cia402.codec import (
     rated_mnm,
     state_of,
 )
-from bridge.cia402.host import WHEELS, heartbeat_ns
+from bridge.cia402.configuration import heartbeat_ns
+from bridge.cia402.host import WHEELS
 from bridge.cia402.objects import CONTROLWORD, TARGET_TORQUE
 from bridge.cia402.sdo import LENGTH, written
 from bridge.frame import Frame

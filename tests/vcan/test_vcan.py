@@ -154,6 +154,7 @@ def test_an_interface_going_down_and_away_is_survived() -> None:
 
 
 def test_receiving_from_others(bus: Bus) -> None:
+    before_ns = time.time_ns()
     with listener() as other:
         for can_id in (0x80000123, 0x20000004, 0x40000105, 0x101):  # extended, error, remote, plain
             other.send(struct.pack("=IB3x8s", can_id, 8, b"01234567"))
@@ -161,6 +162,7 @@ def test_receiving_from_others(bus: Bus) -> None:
     assert [frame and (frame.can_id, frame.remote) for frame in got] == [(0x105, True), (0x101, False)]
     assert got[1] is not None
     assert got[1].data == b"01234567"
+    assert before_ns <= got[1].time_ns <= time.time_ns()
     assert bus.recv(0.0) is None
 
 

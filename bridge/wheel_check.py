@@ -1,0 +1,125 @@
+"""What a referee checks of a robot's torques, whatever the protocol: commands against the envelope, reports against both.
+
+Kinds of findings are those of bridge.referee.  Pure.
+"""
+
+from collections import deque
+from dataclasses import replace
+from math import inf
+from typing import Final
+
+from bridge.native.observe import NativeObserver
+from bridge.observe import Observer
+from bridge.protocols import make_observer
+from echelon.plan import Plan, RobotPlan
+
+_WHEELS: Final = ("right", "left")
+
+
+class WheelCheck:
+    """One robot: its observer, and what its wheels were last asked for."""
+
+    def __init__(self, plan: Plan, robot: RobotPlan) -> None:
+        self.plan = robot
+        self.name = robot.name
+        self.envelope = robot.envelope
+        if plan.can.closed:
+            self.observer: Observer = make_observer(robot)
+            self.cyclic = self.observer.cyclic
+        else:  # no envelope is in the way, but the robot's own limit
+            self.envelope = replace(self.envelope, torque_limit=robot.torque_limit, rise_limit=inf, fall_limit=inf)
+            native = NativeObserver(robot.drive, self.envelope, robot.index)
+            self.observer, self.cyclic = native, {min(native.identifiers): robot.period_ns}
+        drive, motor = robot.drive, robot.drive.motor
+        bits = {"native": drive.torque_scale, "cia402": max(1, round(1000 * motor.rated_torque)) * 1e-6, "odrive": 0.0}
+        self._bit = bits[drive.protocol if plan.can.closed else "native"] * 1.000001
+        slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
+        self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns)
+        self._wheels = [Commands(self._effect_ns) for _ in _WHEELS]
+        self._begin_ns: int | None = None
+
+    def silent(self, time_ns: int) -> bool:
+        """True if at this time some wheel had no command for its watchdog and a period."""
+        wait_ns = self.plan.drive.watchdog_ns + self.plan.drive.period_ns
+        commanded = [wheel.commanded_ns for wheel in self._wheels]
+        return any(time_ns - (self._begin_ns or 0 if at is None else at) > wait_ns for at in commanded)
+
+    def check(self, time_ns: int, sampled_ns: int) -> tuple[list[tuple[str, str]], bool]:
+        """Looks at what the frame that the observer has just taken said of the wheels, in a report that was made at
+        `sampled_ns` at the earliest; returns what is wrong, and whether it was a command for no torque."""
+        said: list[tuple[str, str]] = []
+        stops = False
+        if self._begin_ns is None:
+            self._begin_ns = time_ns
+        for name, commands, reading in zip(_WHEELS, self._wheels, self.observer.wheels, strict=True):
+            if reading.commanded_ns != commands.commanded_ns and reading.commanded is not None:
+                commands.commanded_ns, stops = time_ns, not reading.commanded
+                if time_ns < 0 and reading.commanded:
+                    said.append(("torque before the run", f"{name}: commanded {reading.commanded:g} N m"))
+                self._check_change(name, commands.torque, reading.commanded, said)
+                commands.add(time_ns, reading.commanded)
+            if reading.reported_ns != commands.reported_ns and reading.reported is not None:
+                commands.reported_ns = time_ns
+                if reading.reported:
+                    self._check_report(time_ns, sampled_ns, name, commands, reading.reported, said)
+        return said, stops
+
+    def _check_change(self, name: str, before: float | None, torque: float, said: list[tuple[str, str]]) -> None:
+        rise, fall = self.envelope.rise_limit, self.envelope.fall_limit
+        if before is None or not torque or rise == fall == inf:
+            return
+        # what both have in common: the torque falls to it, then rises from it
+        common = max(0.0, min(torque, before), min(-torque, -before))
+        if abs(torque) - common > rise * 1.000001 + self._bit:
+            said.append(("rise above limit", f"{name}: from {before:g} to {torque:g} N m, by at most {rise:g}"))
+        if abs(before) - common > fall * 1.000001 + self._bit:
+            said.append(("fall above limit", f"{name}: from {before:g} to {torque:g} N m, by at most {fall:g}"))
+
+    def _check_report(
+        self,
+        time_ns: int,
+        sampled_ns: int,
+        name: str,
+        commands: "Commands",
+        torque: float,
+        said: list[tuple[str, str]],
+    ) -> None:
+        assert self._begin_ns is not None
+        if abs(torque) > self.envelope.torque_limit * 1.000001 + self._bit:
+            said.append(("torque above limit", f"{name}: reported {torque:g} N m"))
+        if time_ns < 0 and abs(torque) > self._bit + 1e-6:
+            said.append(("torque before the run", f"{name}: reported {torque:g} N m"))
+        if sampled_ns - self._begin_ns > self._effect_ns:  # who begins to listen does not know what was before
+            least, most = commands.range(sampled_ns)
+            room = self._bit + 1e-6 + 1e-5 * max(-least, most)
+            if not least - room <= torque <= most + room:
+                text = f"{name}: reported {torque:g} N m, commanded were {least:g} to {most:g} N m"
+                said.append(("torque not commanded", text))
+
+
+class Commands:
+    """What one wheel was asked for in the time that may still have an effect."""
+
+    def __init__(self, effect_ns: int) -> None:
+        self.commanded_ns: int | None = None
+        self.reported_ns: int | None = None
+        self.torque: float | None = None
+        self._effect_ns = effect_ns
+        self._highs: deque[tuple[int, float]] = deque()  # each less than those before it
+        self._lows: deque[tuple[int, float]] = deque()  # likewise, negated
+
+    def add(self, time_ns: int, torque: float) -> None:
+        """Takes a command [N m]."""
+        self.torque = torque
+        for window, value in ((self._highs, torque), (self._lows, -torque)):
+            while window and window[-1][1] <= value:
+                window.pop()
+            window.append((time_ns, value))
+
+    def range(self, time_ns: int) -> tuple[float, float]:
+        """Returns the smallest and the largest torque that may still have an effect; zero always may."""
+        for window in (self._highs, self._lows):
+            while window and window[0][0] < time_ns - self._effect_ns:
+                window.popleft()
+        least = -self._lows[0][1] if self._lows else 0.0
+        return min(0.0, least), max(0.0, self._highs[0][1] if self._highs else 0.0)

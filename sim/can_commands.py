@@ -1,0 +1,280 @@
+"""What `echelon can` and `echelon referee` do: listen to the buses of a scenario, or read the can.log of a run's folder."""
+
+import argparse
+import json
+import select
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from bridge.bus import Bus, interface_is_up, open_bus, resolve_url
+from bridge.closed import LOG
+from bridge.frame import Frame
+from bridge.referee import Referee, judge_log, read_run_log
+from echelon.load import ScenarioError, parse
+from echelon.plan import Plan
+from sim.can_table import CanTable, finding_text
+from sim.commands import UsageError, scenario_of
+
+TICK_S: Final = 0.1
+"""Listening looks up so often though nothing comes"""
+SHOW_S: Final = 0.25
+"""Between two tables in a terminal"""
+LINE_S: Final = 1.0
+"""Between two lines, or two objects of JSON"""
+_AT_ONCE: Final = 256
+_PAUSE_S: Final = 0.02
+"""After an error of a bus, so that it can come back"""
+
+
+class Heard(NamedTuple):
+    """A frame, or None where only time passed: run time [ns], number of the bus."""
+
+    time_ns: int
+    bus: int
+    frame: Frame | None
+
+
+def can(arguments: argparse.Namespace, console: Console | None = None) -> int:
+    """`echelon can`: shows what is on the buses, or what was at the end of a run."""
+    plan, folder = _plan_of(arguments)
+    live = folder is None or arguments.can is not None
+    if live and arguments.speed is not None:
+        raise UsageError("--speed: is for a run's folder without --can")
+    if arguments.speed is not None and not arguments.speed > 0:
+        raise UsageError(f"--speed {arguments.speed:g}: must be more than 0")
+    console = console or Console()
+    if not live and arguments.speed is None:
+        assert folder is not None
+        table = CanTable(plan, Referee(plan), _names(plan))
+        for time_ns, bus, frame in _read(folder, plan):
+            table.take(time_ns, bus, frame)
+        table.referee.finish(max(table.time_ns, plan.duration_ns))
+        if arguments.json:
+            print(json.dumps(table.data(table.time_ns), allow_nan=False))
+        else:
+            console.print(table.render(table.time_ns))
+        return 0
+    if live:
+        buses = _open(_urls(plan, arguments.can))
+        table = CanTable(plan, Referee(plan), tuple(bus.url for bus in buses))
+        source = _listen(buses, arguments.seconds)
+    else:
+        assert folder is not None
+        buses = []
+        table = CanTable(plan, Referee(plan), _names(plan))
+        source = _replay(folder, plan, arguments.speed, arguments.seconds)
+    shown = _Shown(table, console, arguments.json)
+    try:
+        for time_ns, number, frame in source:
+            if frame is not None:
+                table.take(time_ns, number, frame)
+            shown.show(time_ns)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        shown.close()
+        for bus in buses:
+            bus.close()
+    return 0
+
+
+def referee(arguments: argparse.Namespace) -> int:
+    """`echelon referee`: 1 if something is found."""
+    plan, folder = _plan_of(arguments)
+    if folder is not None and arguments.can is None:
+        try:
+            summary = judge_log(folder / LOG, plan)
+        except OSError as error:
+            raise UsageError(f"{folder / LOG}: {error.strerror}") from None
+        said = len(summary["findings"])
+    else:
+        summary = _judge_live(plan, arguments)
+        said = 0
+    if arguments.json:
+        print(json.dumps(summary, indent=2, allow_nan=False))
+    else:
+        for finding in summary["findings"][:said]:
+            where = f"{finding['robot']} " if finding["robot"] else ""
+            print(
+                f"{finding['time']:.6f} s  {finding['bus']} {finding['id']}  {where}{finding['kind']}: {finding['text']}"
+            )
+        print(_verdict(summary))
+    return 1 if summary["kinds"] else 0
+
+
+def _judge_live(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Listens until told to end; tells the first findings at once."""
+    tolerance = getattr(arguments, "tolerance", None)
+    if tolerance is not None and not 0 <= tolerance < 1e9:
+        raise UsageError(f"--tolerance {tolerance:g}: must be 0 s or more")
+    judge = Referee(plan, tolerance_ns=None if tolerance is None else round(tolerance * 1e9))
+    buses = _open(_urls(plan, arguments.can))
+    time_ns = 0
+    if not arguments.json:
+        print(f"listening on {', '.join(bus.url for bus in buses)}; Ctrl-C ends it", file=sys.stderr, flush=True)
+    try:
+        for time_ns, number, frame in _listen(buses, arguments.seconds):
+            known = len(judge.kept)
+            found = judge.observe(time_ns, number, frame) if frame is not None else []
+            if not arguments.json and len(judge.kept) > known:
+                for finding in found:
+                    print(finding_text(finding), flush=True)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for bus in buses:
+            bus.close()
+    for finding in judge.finish(time_ns):
+        if not arguments.json:
+            print(finding_text(finding))
+    return judge.summary()
+
+
+def _verdict(summary: dict[str, Any]) -> str:
+    kinds = ", ".join(f"{kind} {count}" for kind, count in summary["kinds"].items())
+    foreign = f", {summary['unknown']} frames of others" if summary["unknown"] else ""
+    seen = f"{summary['frames']} frames of {len(summary['identifiers'])} identifiers{foreign}"
+    return f"{seen}: {f'{sum(summary["kinds"].values())} findings: {kinds}' if kinds else 'no findings'}"
+
+
+class _Shown:
+    """A live table in a terminal, else a line or an object each second."""
+
+    def __init__(self, table: CanTable, console: Console, as_json: bool) -> None:
+        self._table = table
+        self._console = console
+        self._json = as_json
+        self._next_s = time.monotonic()
+        self._live: Live | None = None
+        if console.is_terminal and not as_json:
+            self._live = Live(console=console, auto_refresh=False)
+            self._live.start()
+        else:
+            self._next_s += LINE_S
+
+    def show(self, time_ns: int) -> None:
+        """Shows how things stand at a run time, if it is time to."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        self._next_s = max(self._next_s + (LINE_S if self._live is None else SHOW_S), now_s)
+        if self._live is not None:
+            self._live.update(self._table.render(time_ns), refresh=True)
+            # a table may take long on a slow terminal: frames come first
+            self._next_s = max(self._next_s, now_s + 4 * (time.monotonic() - now_s))
+        elif self._json:
+            print(json.dumps(self._table.data(time_ns), allow_nan=False), flush=True)
+        else:
+            self._console.print(Text(self._table.line(time_ns)), soft_wrap=True)
+
+    def close(self) -> None:
+        """Leaves the last table standing."""
+        if self._live is not None:
+            self._live.stop()
+
+
+def _plan_of(arguments: argparse.Namespace) -> tuple[Plan, Path | None]:
+    """Returns the plan of a scenario or of a run's folder, and that folder.  Raises UsageError."""
+    folder = Path(arguments.scenario)
+    if not folder.is_dir():
+        return scenario_of(arguments)[1], None
+    if arguments.set:
+        raise UsageError(f"--set {arguments.set[0]}: is for a scenario; {folder} is the folder of a run that has been")
+    path = folder / "scenario.toml"
+    try:
+        return parse(path.read_text(encoding="utf-8"), str(path))[1], folder
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    except (ScenarioError, ValueError) as error:
+        raise UsageError(str(error)) from None
+
+
+def _urls(plan: Plan, wanted: str | None) -> list[str]:
+    """Returns where the buses are: what --can says, one for each bus, else what the scenario says."""
+    names = [bus.name for bus in plan.can.buses]
+    urls = wanted.split(",") if wanted else [bus.url for bus in plan.can.buses]
+    if len(urls) != len(names):
+        raise UsageError(
+            f"--can {wanted}: the scenario has {len(names)} buses, {', '.join(names)}: as many, with commas"
+        )
+    for number, url in enumerate(urls):
+        if url == "auto":
+            if not interface_is_up(f"vcan{number}"):
+                raise UsageError(
+                    f"{names[number]}: the bus is not named and there is no vcan{number}; give --can with what "
+                    "`echelon run` says after “frames on”, e.g. --can udp_multicast:239.74.163.2:43113"
+                )
+            urls[number] = f"socketcan:vcan{number}"
+        elif url.partition(":")[0] == "virtual":
+            raise UsageError(f"{url}: is inside the process that opened it; --can socketcan:… or udp_multicast:…")
+    return urls
+
+
+def _open(urls: list[str]) -> list[Bus]:
+    buses: list[Bus] = []
+    try:
+        for url in urls:
+            full = resolve_url(url)
+            kind, _, name = full.partition(":")
+            if kind == "socketcan" and not interface_is_up(name):
+                raise UsageError(f"--can {url}: there is no network interface {name} that is up")
+            buses.append(open_bus(full))
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from None
+    return buses
+
+
+def _listen(buses: list[Bus], seconds: float | None) -> Iterator[Heard]:
+    """Yields what comes, its time counted from now on by the kernel's stamps."""
+    start_ns, start_s = time.time_ns(), time.monotonic()
+    numbers = {bus.fileno(): number for number, bus in enumerate(buses)}
+    errors = [0] * len(buses)
+    while seconds is None or time.monotonic() - start_s < seconds:
+        ready, _, _ = select.select(list(numbers), [], [], TICK_S)
+        for descriptor in ready:
+            number = numbers[descriptor]
+            bus = buses[number]
+            for _ in range(_AT_ONCE):
+                received = bus.recv(0.0)
+                if received is None:
+                    break
+                time_ns = max(0, received.time_ns - start_ns)
+                yield Heard(time_ns, number, Frame(received.can_id, received.data, received.remote))
+            if bus.counts.recv_failed > errors[number]:
+                if not errors[number]:
+                    print(f"echelon: {bus.url}: {bus.error}", file=sys.stderr, flush=True)
+                errors[number] = bus.counts.recv_failed
+                time.sleep(_PAUSE_S)
+        yield Heard(max(0, time.time_ns() - start_ns), 0, None)
+
+
+def _replay(folder: Path, plan: Plan, speed: float, seconds: float | None) -> Iterator[Heard]:
+    """Yields the frames of a run's can.log, `speed` times as fast as they were, for so many seconds of the clock."""
+    start_s, first_ns = time.monotonic(), 0
+    for count, (time_ns, bus, frame) in enumerate(_read(folder, plan)):
+        first_ns = first_ns if count else time_ns
+        due_s = start_s + (time_ns - first_ns) * 1e-9 / speed
+        while (ahead_s := due_s - time.monotonic()) > 0:
+            if seconds is not None and time.monotonic() - start_s >= seconds:
+                return
+            time.sleep(min(ahead_s, TICK_S))
+            yield Heard(round(time_ns - max(0.0, due_s - time.monotonic()) * speed * 1e9), 0, None)
+        yield Heard(time_ns, bus, frame)
+
+
+def _read(folder: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:
+    try:
+        yield from read_run_log(folder / LOG, plan)
+    except OSError as error:
+        raise UsageError(f"{folder / LOG}: {error.strerror}") from None
+
+
+def _names(plan: Plan) -> tuple[str, ...]:
+    return tuple(bus.name for bus in plan.can.buses)

@@ -1,11 +1,11 @@
-"""`python -m bench`: the lockstep beside its peers, then whole runs, in one go on one machine."""
+"""`python -m bench`: the lockstep beside its peers, whole runs, then the CAN bus, in one go on one machine."""
 
 import argparse
 import json
 import sys
 from dataclasses import asdict
 
-from bench import lockstep, product
+from bench import can, lockstep, product
 
 
 def main() -> int:
@@ -15,12 +15,12 @@ def main() -> int:
         "--ticks", type=int, default=2000, help="ticks of a lockstep; slow peers run a fifth (default 2000)"
     )
     parser.add_argument("--repeat", type=int, default=5, help="runs of each kind (default 5)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="run time of paper.toml (default 3)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="run time of scenarios as processes (default 3)")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     options = parser.parse_args()
     machine = lockstep.machine()
     runs, failures = lockstep.compare(list(lockstep.PEERS), options.ticks, options.repeat)
-    rows = product.measure(options.repeat, options.seconds)
+    rows = product.measure(options.repeat, options.seconds) + can.measure(options.repeat, options.seconds)
     if options.json:
         peers = {name: [asdict(one) for one in found] for name, found in runs.items()}
         print(json.dumps({"machine": machine, "peers": peers, "failures": failures, "runs": [asdict(r) for r in rows]}))

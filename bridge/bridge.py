@@ -7,6 +7,7 @@ does not let pass.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -155,6 +156,10 @@ class Bridge:
         self.frames += len(frames)
         self._bits += sum(frame_bits(can_id, data) for can_id, data in frames)
         return frames
+
+    def stopped(self) -> Counter[str]:
+        """How many torques did not reach a wheel, by reason, over all robots."""
+        return sum((Counter(counts.stopped) for counts in self.counts), Counter[str]())
 
     @property
     def bits(self) -> int:

@@ -1,6 +1,7 @@
 """The bridge at work on a closed torque path: its role, its buses, can.log and the DBC; and what there is to tell of them."""
 
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -93,13 +94,13 @@ class ClosedStation:
 
     def progress(self) -> dict[str, Any]:
         """Returns what a live table shows."""
-        stopped = sum(robot.stopped.total() for robot in self.role.robots)
+        stopped = sum((robot.stopped for robot in self.role.robots), Counter[str]())
         faults = [f"{robot.robot.name} {robot.host.fault}" for robot in self.role.robots if robot.host.fault]
         return {
             "url": self.url,
             "load": max(bus.load for bus in self.role.buses),
             "frames": self.frames,
-            "stopped": stopped,
+            "stopped": ", ".join(f"{number} {reason}" for reason, number in stopped.most_common()),
             "faults": faults,
             "note": self.rail.waiting,
         }

@@ -2,16 +2,17 @@
 
 A frame waits while others have the bus, and a full bus breaks no contract.  So a frame is only late by the time that the
 bus was free while it was due: from then to the beginning of the stretch of frames, one right after the other, that it is
-part of.  The next one is due a period after this one was, or after that beginning if this one was late.
+part of.  The next one is due a period after this one was.
 
 A frame that is missing shifts all later ones by a period.  On a busy bus only a part of that can be told from waiting, so
 five frames in a row that are late by 2 ms and an eighth of the period are a gap, too; nothing can be told of a bus that is
 never free for so long.  Pauses shorter than a frame and an error frame count as busy, for destroyed frames are not seen;
 where the plan has disturbances, pauses shorter than five of them, and frames in a row are not looked at.
 
-What may come early.  Where a sender was held up it may send what it owes right away: one frame for each period of the delay.
-A remote frame asks for one more as well, and a command for no torque may come at any time.  A CANopen node that boots
-begins anew.
+What may come early.  A sender that was held up may send what it owes at once, frames that follow each other within half a
+period, until one is due again; with the first that does not follow so it has caught up, and what has not come is lost.  A
+remote frame asks for one more as well, and a command for no torque may come at any time.  A CANopen node that boots begins
+anew.
 """
 
 from math import ceil
@@ -36,6 +37,8 @@ class Watch:
     """One identifier: whose it is, its period (0: it comes as it likes), when it is due."""
 
     __slots__ = (
+        "_begin_ns",
+        "_catching_up",
         "_first_gap_ns",
         "_gaps",
         "_last_ns",
@@ -72,7 +75,9 @@ class Watch:
         self.first_ns = 0
         self.due_ns: int | None = None
         self.silent = False  # which was told
-        self._owed = 0
+        self._owed = 0  # frames that were asked for
+        self._catching_up = False  # it may send what it owes
+        self._begin_ns = 0  # of the last frame
         self._shifted = self._shift_ns = 0  # how many frames in a row were late, by how much at least
         self._last_ns: int | None = None  # in the run
         self._gaps = self._sum = self._squares = 0  # of distances, less the first one's
@@ -95,22 +100,27 @@ class Watch:
             self._measure(time_ns)
         if not self.period_ns:
             return None
-        if self.due_ns is None or self.silent:
-            self.silent = False
+        last_ns, self._begin_ns = self._begin_ns, begin_ns
+        if self.due_ns is None:
             self.due_ns = begin_ns + self.period_ns
             return None
-        late_ns = busy_ns - self.due_ns
         if self.due_ns - begin_ns > self.half_ns:
             if self._owed:
                 self._owed -= 1
                 return None
             return "burst", f"{(self.due_ns - begin_ns) / 1e6:.4g} ms before it was due"
-        if late_ns > self.tolerance_ns:
-            told: tuple[str, str] | None = self._late(late_ns)
-            self.due_ns = busy_ns
+        late_ns, told = busy_ns - self.due_ns, None
+        if self._catching_up and begin_ns - last_ns > self.half_ns:  # what it owes and did not send is lost
+            self._catching_up = False
+            periods = max(0, (busy_ns - self.due_ns + self.half_ns) // self.period_ns)
+            self.due_ns = max(self.due_ns + periods * self.period_ns, busy_ns)
+        elif self._catching_up or self.silent:
+            self._catching_up, self.silent = True, False
+        elif late_ns > self.tolerance_ns:
+            self._catching_up = True
+            told = self._late(late_ns)
         else:
             told = self._follow(begin_ns - self.due_ns, late_ns)
-        self._owed = max(1, round(late_ns / self.period_ns)) if late_ns > self.half_ns else max(0, self._owed - 1)
         self.due_ns = min(self.due_ns, begin_ns) + self.period_ns
         return told
 
@@ -134,7 +144,7 @@ class Watch:
 
     def forget(self) -> None:
         """Its sender begins anew."""
-        self.due_ns, self._last_ns = None, None
+        self.due_ns, self._last_ns, self._catching_up, self.silent = None, None, False, False
 
     def _measure(self, time_ns: int) -> None:
         last_ns, self._last_ns = self._last_ns, time_ns

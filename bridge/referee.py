@@ -18,7 +18,7 @@ When frames are due tells bridge.due: waiting for the bus is not being late, nei
 same reason feedback may be as old as the stretch of frames that it came in.
 
 Identifiers that no robot of the plan uses are foreign traffic, which is legal: counted, not judged.  Where the torque path
-is not closed robots send native torque frames, one per acceleration period, whatever drives they have, and nobody answers.
+is not closed there are torques alone, one per acceleration period, and nobody answers.
 """
 
 from collections import Counter
@@ -207,11 +207,11 @@ def _shared(plan: Plan) -> Iterator[tuple[int, int, int]]:
         yield bus, HEARTBEAT_ID + HOST_NODE, heartbeat_ns(period_ns, plan.can.watchdog_ns)
 
 
-def judge_log(path: Path, plan: Plan) -> dict[str, Any]:
+def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None) -> dict[str, Any]:
     """Returns the referee's summary of a run's can.log.  A log that ends before the run should is silence.
 
     Raises OSError if it cannot be read."""
-    referee = Referee(plan)
+    referee = Referee(plan, tolerance_ns=tolerance_ns)
     last_ns = 0
     for time_ns, bus, frame in read_run_log(path, plan):
         last_ns = time_ns

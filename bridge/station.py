@@ -88,7 +88,13 @@ class Station:
 
     def progress(self) -> dict[str, Any]:
         """Returns what a live table shows."""
-        return {"url": self.url, "load": self._load(), "frames": self._bridge.frames}
+        stopped = self._bridge.stopped()
+        return {
+            "url": self.url,
+            "load": self._load(),
+            "frames": self._bridge.frames,
+            "stopped": ", ".join(f"{number} {reason}" for reason, number in stopped.most_common()),
+        }
 
     def result(self) -> dict[str, Any]:
         """Returns the counts of bridge, bus and log, and the load this would be on a real bus, for the summary."""

@@ -4,12 +4,16 @@ Kinds of findings are those of bridge.referee.  Pure.
 """
 
 from collections import deque
-from dataclasses import replace
 from math import inf
 from typing import Final
 
-from bridge.native.observe import NativeObserver
+from bridge.cia402.codec import RPDO_IDS
+from bridge.native.codec import BASE_ID
 from bridge.observe import Observer
+from bridge.odrive.codec import frame_id
+from bridge.odrive.config import ODriveConfig
+from bridge.odrive.enums import Command
+from bridge.odrive.observe import ODriveObserver
 from bridge.protocols import make_observer
 from echelon.plan import Plan, RobotPlan
 
@@ -23,16 +27,10 @@ class WheelCheck:
         self.plan = robot
         self.name = robot.name
         self.envelope = robot.envelope
-        if plan.can.closed:
-            self.observer: Observer = make_observer(robot)
-            self.cyclic = self.observer.cyclic
-        else:  # no envelope is in the way, but the robot's own limit
-            self.envelope = replace(self.envelope, torque_limit=robot.torque_limit, rise_limit=inf, fall_limit=inf)
-            native = NativeObserver(robot.drive, self.envelope, robot.index)
-            self.observer, self.cyclic = native, {min(native.identifiers): robot.period_ns}
+        self.observer, self.cyclic = (_closed if plan.can.closed else _mirrored)(robot)
         drive, motor = robot.drive, robot.drive.motor
         bits = {"native": drive.torque_scale, "cia402": max(1, round(1000 * motor.rated_torque)) * 1e-6, "odrive": 0.0}
-        self._bit = bits[drive.protocol if plan.can.closed else "native"] * 1.000001
+        self._bit = bits[drive.protocol] * 1.000001
         slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
         self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns)
         self._wheels = [Commands(self._effect_ns) for _ in _WHEELS]
@@ -95,6 +93,25 @@ class WheelCheck:
             if not least - room <= torque <= most + room:
                 text = f"{name}: reported {torque:g} N m, commanded were {least:g} to {most:g} N m"
                 said.append(("torque not commanded", text))
+
+
+def _closed(robot: RobotPlan) -> tuple[Observer, dict[int, int]]:
+    observer = make_observer(robot)
+    return observer, observer.cyclic
+
+
+def _mirrored(robot: RobotPlan) -> tuple[Observer, dict[int, int]]:
+    """What is to be heard where nobody answers: torques, once per acceleration period."""
+    drive = robot.drive
+    observer = make_observer(robot)
+    if drive.protocol == "odrive":
+        observer = ODriveObserver(drive, robot.envelope, robot.index, ODriveConfig(heartbeat_msg_rate_ms=0))
+        can_ids = [frame_id(node, Command.SET_INPUT_TORQUE) for node in drive.node_ids]
+    elif drive.protocol == "cia402":
+        can_ids = [RPDO_IDS[1] + node for node in drive.node_ids]
+    else:
+        can_ids = [BASE_ID + robot.index]
+    return observer, dict.fromkeys(can_ids, robot.period_ns)
 
 
 class Commands:

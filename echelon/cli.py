@@ -39,11 +39,11 @@ def parser() -> argparse.ArgumentParser:
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".")
 
-    def scenario(command: argparse.ArgumentParser, optional: bool = False) -> None:
+    def scenario(command: argparse.ArgumentParser, optional: bool = False, more: str = "") -> None:
         command.add_argument(
             "scenario",
             nargs="?" if optional else None,
-            help="a TOML file, or the name of a shipped scenario (paper, lab, …)",
+            help=f"a TOML file, or the name of a shipped scenario (paper, lab, …){more}",
         )
         command.add_argument(
             "--set",
@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
         )
 
     def listening(command: argparse.ArgumentParser) -> None:
-        scenario(command)
+        scenario(command, more=", or the folder of a run")
         command.add_argument("--can", metavar="URL", help="where to listen; of several buses all, with commas between")
         command.add_argument("--seconds", type=float, metavar="S", help="end after so long (default: at Ctrl-C)")
         command.add_argument("--json", action="store_true", help="print JSON")

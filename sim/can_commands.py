@@ -20,7 +20,8 @@ from bridge.referee import Referee, judge_log, read_run_log
 from echelon.load import ScenarioError, parse
 from echelon.plan import Plan
 from sim.can_table import CanTable, finding_text
-from sim.commands import UsageError, scenario_of
+from sim.commands import scenario_of
+from sim.usage import UsageError
 
 TICK_S: Final = 0.1
 """Listening looks up so often though nothing comes"""
@@ -53,13 +54,13 @@ def can(arguments: argparse.Namespace, console: Console | None = None) -> int:
     if not live and arguments.speed is None:
         assert folder is not None
         table = CanTable(plan, Referee(plan), _names(plan))
-        for time_ns, bus, frame in _read(folder, plan):
-            table.take(time_ns, bus, frame)
+        for logged in _read(folder, plan):
+            table.take(*logged)
         table.referee.finish(max(table.time_ns, plan.duration_ns))
         if arguments.json:
             print(json.dumps(table.data(table.time_ns), allow_nan=False))
         else:
-            console.print(table.render(table.time_ns))
+            console.print(table.render(table.time_ns, console.width))
         return 0
     if live:
         buses = _open(_urls(plan, arguments.can))
@@ -141,7 +142,7 @@ def _verdict(summary: dict[str, Any]) -> str:
     kinds = ", ".join(f"{kind} {count}" for kind, count in summary["kinds"].items())
     foreign = f", {summary['unknown']} frames of others" if summary["unknown"] else ""
     seen = f"{summary['frames']} frames of {len(summary['identifiers'])} identifiers{foreign}"
-    return f"{seen}: {f'{sum(summary["kinds"].values())} findings: {kinds}' if kinds else 'no findings'}"
+    return f"{seen}: {sum(summary['kinds'].values())} findings: {kinds}" if kinds else f"{seen}: no findings"
 
 
 class _Shown:
@@ -166,7 +167,7 @@ class _Shown:
             return
         self._next_s = max(self._next_s + (LINE_S if self._live is None else SHOW_S), now_s)
         if self._live is not None:
-            self._live.update(self._table.render(time_ns), refresh=True)
+            self._live.update(self._table.render(time_ns, self._console.width), refresh=True)
             # a table may take long on a slow terminal: frames come first
             self._next_s = max(self._next_s, now_s + 4 * (time.monotonic() - now_s))
         elif self._json:
@@ -209,7 +210,7 @@ def _urls(plan: Plan, wanted: str | None) -> list[str]:
             if not interface_is_up(f"vcan{number}"):
                 raise UsageError(
                     f"{names[number]}: the bus is not named and there is no vcan{number}; give --can with what "
-                    "`echelon run` says after “frames on”, e.g. --can udp_multicast:239.74.163.2:43113"
+                    "`echelon run` says after 'frames on', e.g. --can udp_multicast:239.74.163.2:43113"
                 )
             urls[number] = f"socketcan:vcan{number}"
         elif url.partition(":")[0] == "virtual":

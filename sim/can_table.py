@@ -20,6 +20,8 @@ from echelon.plan import Plan, RobotPlan
 WHEELS: Final = ("right", "left")
 HALF: Final = 8
 """Cells of a bar on each side of zero"""
+BARS_FROM: Final = 110
+"""Columns of a terminal"""
 FINDINGS: Final = 5
 """The last ones, told in full"""
 _SLOT_NS: Final = 100_000_000
@@ -140,41 +142,37 @@ class CanTable:
         parts.append("findings: " + (_counted(data["kinds"]) or "none"))
         return "  ".join(parts)
 
-    def render(self, time_ns: int) -> RenderableType:
-        """Returns how everything stands as a table, what is wrong in red."""
+    def render(self, time_ns: int, width: int = 120) -> RenderableType:
+        """Returns how everything stands as a table, what is wrong in red; bars where there is room for them."""
+        bars = width >= BARS_FROM
         table = Table(box=None, padding=(0, 1), header_style="dim")
-        for name, side in (
-            ("robot", "left"),
-            ("wheel", "left"),
-            ("commanded [N m]", "right"),
-            ("", "left"),
-            ("reported [N m]", "right"),
-            ("", "left"),
-            ("speed [rad/s]", "right"),
-            ("state", "left"),
-            ("fault", "left"),
-            ("age [ms]", "right"),
-            ("frames/s", "right"),
-        ):
-            table.add_column(name, justify="right" if side == "right" else "left", no_wrap=True)
+        for name in ("robot", "wheel"):
+            table.add_column(name, no_wrap=True)
+        for name in ("commanded", "reported"):
+            table.add_column(f"{name}\n[N m]", justify="right", no_wrap=True)
+            if bars:
+                table.add_column("", no_wrap=True)
+        table.add_column("speed\n[rad/s]", justify="right", no_wrap=True)
+        table.add_column("state")
+        table.add_column("fault")
+        table.add_column("age\n[ms]", justify="right", no_wrap=True)
+        table.add_column("frames\n[1/s]", justify="right", no_wrap=True)
         for robot, observer, rate in zip(self.plan.robots, self.referee.observers, self._of_robot, strict=True):
             limit = torque_limit(robot)
             for number, (name, wheel) in enumerate(zip(WHEELS, observer.wheels, strict=True)):
+                cells: list[RenderableType] = ["" if number else robot.name, name]
+                for torque in (wheel.commanded, wheel.reported):
+                    cells += [_number(torque, 3), bar(torque, limit)] if bars else [_number(torque, 3)]
                 age = _age(wheel, time_ns)
                 old = age is not None and age * 1e9 > robot.drive.watchdog_ns
-                table.add_row(
-                    "" if number else robot.name,
-                    name,
-                    _number(wheel.commanded, 3),
-                    bar(wheel.commanded, limit),
-                    _number(wheel.reported, 3),
-                    bar(wheel.reported, limit),
+                cells += [
                     _number(wheel.speed, 2),
                     wheel.state or "–",
                     Text(wheel.fault, style="bold red"),
                     Text("–" if age is None else f"{1e3 * age:.0f}", style="bold red" if old else ""),
                     "" if number else f"{rate.per_second(time_ns):.0f}",
-                )
+                ]
+                table.add_row(*cells)
         return Group(self._heading(time_ns), table, *self._findings())
 
     def _heading(self, time_ns: int) -> Text:
@@ -233,7 +231,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+    return "–" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _counted(kinds: dict[str, int]) -> str:

@@ -21,7 +21,7 @@ from sim.process import main
 PRELOAD: Final = ["sim.process"]
 LAST_WORDS: Final = 4000
 """Bytes kept of what a process says on standard error."""
-FINISHING: Final = ("bridge", "drives", "recorder")
+FINISHING: Final = ("bridge", "drives", "referee", "recorder")
 """Processes that are told when to finish, in the order in which they are; bridge and drives keep step with the run by
 themselves where the torque path is closed and time is virtual."""
 
@@ -194,6 +194,13 @@ def list_specs(
                 peers=(*everyone, *((name, name) for name in stations)),
                 member=False,
                 **common,
+            )
+        )
+    if not virtual and any(url.startswith("socketcan") for url in can_urls):
+        # Elsewhere it would cost too much to hear every frame once more: there can.log is judged afterwards.
+        specs.append(
+            ProcessSpec(
+                kind="referee", name="referee", index=-1, listen=(), connect=(), peers=(), member=False, **common
             )
         )
     # Those that import most start first.

@@ -10,15 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from echelon.load import ScenarioError, load, parse
+from echelon.load import ScenarioError, load
 from echelon.plan import Plan
 from echelon.scenario import Scenario
+from sim.usage import UsageError
 
 SCENARIOS = Path(__file__).resolve().parent.parent / "deploy" / "scenarios"
-
-
-class UsageError(Exception):
-    """A mistake of the user's; the text is one line."""
 
 
 def scenario_of(arguments: argparse.Namespace) -> tuple[Scenario, Plan]:
@@ -162,51 +159,11 @@ def validate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _read_run(folder: Path) -> Any:
-    """Reads a run's folder for a report.  Raises UsageError."""
-    from bridge.native.codec import NativeCodec
-    from sim.recording import read_trace
-    from sim.report import RunForReport
-
-    try:
-        toml = (folder / "scenario.toml").read_text(encoding="utf-8")
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        _, plan = parse(toml, str(folder / "scenario.toml"))
-        trace = read_trace(folder / "run.mcap", plan)
-    except OSError as error:
-        raise UsageError(f"{error.filename}: {error.strerror}") from None
-    except (ScenarioError, ValueError) as error:
-        raise UsageError(f"{folder}: {error}") from None
-    frames = _first_frames(folder / "can.log", plan, NativeCodec(plan.can.torque_scale))
-    return RunForReport(folder.name, trace, summary, toml, frames)
-
-
-def _first_frames(path: Path, plan: Plan, codec: Any, count: int = 18) -> tuple[dict[str, object], ...]:
-    """Returns the first frames of a run's can.log, decoded; none if there is no log."""
-    from bridge.canlog import read_frames
-    from bridge.native.codec import Torque
-
-    rows = []
-    for time_ns, identifier, data in read_frames(path, count):
-        torque = codec.decode(identifier, data)
-        if isinstance(torque, Torque):
-            rows.append(
-                {
-                    "t [s]": f"{time_ns / 1e9:.6f}",
-                    "frame": f"{identifier:03X}#{data.hex().upper()}",
-                    "robot": plan.robots[torque.robot].name if torque.robot < len(plan.robots) else "?",
-                    "τ right [N m]": f"{torque.tau_right:g}",
-                    "τ left [N m]": f"{torque.tau_left:g}",
-                    "counter": torque.counter,
-                }
-            )
-    return tuple(rows)
-
-
 def _report(folders: list[Path], path: Path) -> None:
     from sim.report import write_report
+    from sim.run_folder import read_run
 
-    write_report([_read_run(folder) for folder in folders], path)
+    write_report([read_run(folder) for folder in folders], path)
 
 
 def report(arguments: argparse.Namespace) -> int:
@@ -225,9 +182,10 @@ def export(arguments: argparse.Namespace) -> int:
     """`echelon export`"""
     from sim.export import export_csv
     from sim.recording import read_links
+    from sim.run_folder import read_run
 
     folder = Path(arguments.run)
-    run_read = _read_run(folder)
+    run_read = read_run(folder)
     try:
         arguments.csv.mkdir(parents=True, exist_ok=True)
         export_csv(run_read.trace, [counts for _, counts in read_links(folder / "run.mcap")], arguments.csv)

@@ -18,6 +18,8 @@ from sim.supervisor import Progress
 
 PLAIN_S = 2.0
 """Between two plain lines."""
+FAULTS = 3
+"""Faults of drives that are shown in words."""
 
 
 class Display:
@@ -39,9 +41,10 @@ class Display:
 
     def show(self, progress: Progress) -> None:
         """Shows how the run stands."""
-        if progress.note and progress.note != self._note:
-            self._note = progress.note
-            self.say(progress.note)
+        note = progress.note or progress.can.get("note", "") or progress.can.get("drives_note", "")
+        if note and note != self._note:
+            self.say(note)
+        self._note = note or self._note
         if self._quiet:
             return
         if self._live is not None:
@@ -93,6 +96,10 @@ class Display:
         ]
         if "load" in progress.can:
             facts.append(("CAN load", f"{100 * progress.can['load']:.0f} %"))
+        if progress.can.get("stopped"):
+            facts.append(("torques stopped", f"{progress.can['stopped']}"))
+        if faults := progress.can.get("faults"):
+            facts.append(("drive faults", ", ".join(faults[:FAULTS]) + (" …" if len(faults) > FAULTS else "")))
         return facts
 
     def _table(self, progress: Progress) -> Any:

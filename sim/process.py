@@ -41,6 +41,8 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     try:
         if spec.kind == "recorder":
             from sim.watchers import run_recorder as body
+        elif spec.kind == "referee":
+            from sim.wall_stations import run_wall_referee as body
         elif spec.kind in ("bridge", "drives"):
             body = _station_body(spec)
         else:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sim.blocks import Blocks, block_series
+from sim.can_report import can_section
 from sim.distances import Distances, distances
 from sim.figures import SMALL_MULTIPLES, errors, smallest_distance, trajectories, transformed_state, wheel_torques
 from sim.page import (
@@ -27,18 +28,6 @@ from sim.trace import Trace
 
 MAX_ROWS: Final = 60
 """Rows of a table on the page; the summary has them all."""
-CAN_WORDS: Final = {
-    "url": "bus",
-    "bitrate": "bit rate [bit/s]",
-    "torque_scale": "torque per bit [N m]",
-    "frames": "frames",
-    "bits": "bits on the bus",
-    "torque_limit": "largest torque of a frame [N m]",
-    "load_mean": "mean load",
-    "load_peak": "peak load",
-    "clipped": "frames with a clipped torque",
-}
-"""Keys of the summary's `can` table that have a word of their own; loads are shares of the bus's capacity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,47 +229,7 @@ def _torques(one: _Shown) -> str:
 
 
 def _can(one: _Shown) -> str:
-    can = one.run.summary["can"]
-    if not can or not can.get("enabled", True):
-        return paragraph("No bus in this run.")
-    robots = can.get("robots") or {}
-    clipped = can.get("clipped", sum(row.get("clipped", 0) for row in robots.values()))
-    words = [*([f"{can['load']}."] if can.get("load") else []), *_bus_load(one)]
-    words.append(
-        f"In {clipped} frames a torque did not fit and was clipped." if clipped else "Every torque fitted its frame."
-    )
-    plain = [(key, value) for key, value in can.items() if isinstance(value, int | float | str)]
-    shown = [(key, value) for key, value in plain if key not in ("enabled", "load")]
-    text = paragraph(" ".join(words))
-    text += table(["", ""], [[CAN_WORDS.get(key, key.replace("_", " ")), _plain(key, value)] for key, value in shown])
-    if robots:
-        keys = [key for key, value in next(iter(robots.values())).items() if isinstance(value, int)]
-        rows = [[name, *(row.get(key) for key in keys)] for name, row in list(robots.items())[:MAX_ROWS]]
-        text += table(["robot", *keys], rows) + _rest(len(robots))
-    if one.run.frames:
-        keys = list(one.run.frames[0])
-        rows = [[frame.get(key, "") for key in keys] for frame in one.run.frames[:MAX_ROWS]]
-        text += subheading("First frames") + table(keys, rows, numeric_from=len(keys))
-    return text
-
-
-def _bus_load(one: _Shown) -> list[str]:
-    """Says how full a real bus would be: as passed in, or from the bits that were counted."""
-    can, simulated = one.run.summary["can"], one.run.summary["simulated"]
-    mean, peak = can.get("load_mean"), can.get("load_peak")
-    if mean is None and can.get("bits") and simulated:
-        mean = can["bits"] / (simulated * one.run.trace.plan.can.buses[0].bitrate)
-    if mean is None:
-        return []
-    most = f", at most {100 * peak:.3g} %" if peak is not None else ""
-    over = " — more than a real bus can carry" if max(mean, peak or 0.0) > 1 else ""
-    return [f"On a real bus these frames would be a load of {100 * mean:.3g} %{most}{over}."]
-
-
-def _plain(key: str, value: object) -> str:
-    if key.startswith("load_") and isinstance(value, int | float):
-        return f"{100 * value:.3g} %"
-    return number(value) if isinstance(value, float) else str(value)
+    return can_section(one.run.summary["can"], one.run.frames)
 
 
 def _links(one: _Shown) -> str:

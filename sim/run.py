@@ -94,6 +94,8 @@ def execute(
             show=display.show,
             stall_timeout_s=stall_timeout_s,
         ).run()
+    if outcome.can and "referee" not in outcome.can:
+        outcome.can["referee"] = judged(folder / "can.log", plan, clock)
     display.close()
     summary = summarise(outcome.trace, outcome.links, outcome.can, _run_facts(plan, outcome, engine, clock))
     if outcome.failure:
@@ -102,6 +104,14 @@ def execute(
         verdict["reasons"].insert(0, outcome.failure.splitlines()[0])
     write(summary, folder / "summary.json")
     return Finished(folder, summary, outcome.trace, outcome.failure)
+
+
+def judged(log: Path, plan: Plan, clock: str) -> dict[str, Any]:
+    """Returns what the referee finds in a run's can.log."""
+    from bridge.referee import judge_log
+
+    tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
+    return judge_log(log, plan, tolerance_ns=tolerance_ns) | {"source": "can.log"}
 
 
 def _in_process(

@@ -342,7 +342,7 @@ class Supervisor:
             trace=recorded.get("trace") or TraceBuilder(self.plan).build(),
             links=[counts for result in results for counts in result.links],
             results=results,
-            can=extra.get("bridge", {}) | ({"drives": extra["drives"]} if "drives" in extra else {}),
+            can=extra.get("bridge", {}) | {kind: extra[kind] for kind in ("drives", "referee") if kind in extra},
             startup_s=startup_s,
             wall_s=wall_s,
             messages=recorded.get("messages", 0),

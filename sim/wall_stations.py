@@ -22,6 +22,7 @@ from bridge.closed import ClosedStation
 from bridge.drive_bank import DriveBank
 from bridge.frame import Frame
 from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
+from bridge.referee import Referee
 from echelon.layout import message_size
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
@@ -109,7 +110,7 @@ class WallBridge:
             before = self._last[message.source]
             if before is None or message.sequence > before.sequence:
                 self._last[message.source] = message
-                self._send_robot(now_ns, message.source)
+                self._send_robot(now_ns, message.source, message.time_ns // self._period_ns)
                 latency_ns = now_ns - message.time_ns
                 self.latencies.append(latency_ns)
                 self.in_time += latency_ns < self._period_ns
@@ -126,8 +127,7 @@ class WallBridge:
         """Does what is due: a new period, and telling robots of the one that ended."""
         while now_ns >= self._cycle * self._period_ns:
             for robot in range(len(self._last)):
-                if self._sent_in[robot] < self._cycle - 1:
-                    self._send_robot(now_ns, robot)
+                self._send_robot(now_ns, robot, self._cycle - 1)  # again, if nothing newer came
             self._role.apply_events(now_ns)
             for bus, frames in self._role.bus_frames(now_ns):
                 for frame in frames:
@@ -169,9 +169,12 @@ class WallBridge:
         result["refused_messages"] = self.mail.refused
         return result
 
-    def _send_robot(self, now_ns: int, robot: int) -> None:
+    def _send_robot(self, now_ns: int, robot: int, cycle: int) -> None:
+        """Sends the newest torque of a robot for a period, once: one that is late goes with the next period's."""
+        if cycle <= self._sent_in[robot]:
+            return
         torques = self._role.robots[robot]
-        self._sent_in[robot] = self._cycle - 1
+        self._sent_in[robot] = cycle
         for frame in torques.frames(now_ns, self._last[robot]):
             self._put(now_ns, torques.robot.drive.bus, frame)
 
@@ -210,7 +213,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         return time.monotonic_ns() - start_ns
 
     while True:
-        _wait([control, bridge.mail, *_readable(bridge.station.buses)], bridge.due_ns - now())
+        _wait([control, bridge.mail, *bridge.station.buses], bridge.due_ns - now())
         bridge.frames(now())
         bridge.torques(now())
         bridge.pass_time(now())
@@ -254,9 +257,36 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
     control.recv()
 
 
+def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    """The process of the referee of a run on a wall clock: it hears the buses, and nobody else."""
+    try:
+        buses = [open_bus(url) for url in spec.can_urls]
+    except (ValueError, OSError) as error:
+        raise StartError(str(error)) from None
+    # Processes wait for their turn; only what a drive's watchdog would notice, too, is late.
+    referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
+    start_ns = meet(spec, session, control)
+    run_epoch_ns = time.time_ns() - time.monotonic_ns() + start_ns
+    while True:
+        _wait([control, *buses], PROGRESS_NS)
+        for number, bus in enumerate(buses):
+            while (received := bus.recv(0.0)) is not None:
+                frame = Frame(received.can_id, received.data, received.remote)
+                referee.observe(received.time_ns - run_epoch_ns, number, frame)
+        if control.poll():
+            control.recv()
+            break
+    for bus in buses:
+        bus.close()
+    cpu_s, resident = resources()
+    extra = referee.summary() | {"source": "bus"}
+    control.send(("done", Result(spec.name, cpu_s, resident, extra=extra)))
+    control.recv()
+
+
 def serve(bank: DriveBank, buses: Sequence[Bus], start_ns: int, also: Sequence[Any] = ()) -> None:
     """Waits for what comes next, a frame or an instant of the drives' own, and lets them work; `also` ends the wait too."""
-    _wait([*also, *_readable(buses)], bank.due_ns - (time.monotonic_ns() - start_ns))
+    _wait([*also, *buses], bank.due_ns - (time.monotonic_ns() - start_ns))
     for number, bus in enumerate(buses):
         while (received := bus.recv(0.0)) is not None:
             now_ns = time.monotonic_ns() - start_ns
@@ -272,7 +302,3 @@ def _send(buses: Sequence[Bus], frames: Sequence[TimedFrame]) -> None:
 def _wait(sources: Sequence[Any], left_ns: int) -> None:
     """Sleeps until one of the sources is readable or the time is over."""
     select.select(sources, (), (), min(max(left_ns, 0), PROGRESS_NS) * 1e-9)
-
-
-def _readable(buses: Sequence[Bus]) -> list[Bus]:
-    return list(buses)

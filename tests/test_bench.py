@@ -3,7 +3,10 @@
 import pytest
 
 from bench import lockstep
+from bench.can import Robots, bus_rates, closed_in_process
 from bench.product import Row, table
+from bridge.bus import open_bus, resolve_url
+from bridge.native.codec import NativeCodec, Torque
 
 
 @pytest.mark.parametrize("peer", ["zenoh", "pipes"])
@@ -23,3 +26,29 @@ def test_a_peer_that_is_not_installed_is_no_crash(monkeypatch: pytest.MonkeyPatc
 
 def test_table_quotes_medians() -> None:
     assert table([Row("start-up", "s", (3.0, 1.0, 2.0))]).splitlines()[1].split()[-3:] == ["2", "1", "3"]
+
+
+def test_what_is_measured_on_the_bus_are_torques() -> None:
+    robots, codec = Robots(), NativeCodec(0.001)
+    with open_bus("virtual:bench") as bus:
+        rate, frames = robots.send(bus, 3)
+        assert bus.counts.sent == len(frames) == 3 * 9
+    assert rate > 0
+    torques = [codec.decode(can_id, data) for can_id, data, _ in frames]
+    assert all(isinstance(torque, Torque) and torque.enable_left and torque.tau_left == -0.5 for torque in torques)
+    assert len({torque.tau_right for torque in torques if isinstance(torque, Torque)}) == 3
+
+
+def test_all_ways_over_a_bus_are_measured() -> None:
+    url = resolve_url("auto")
+    try:
+        open_bus(url).close()
+    except OSError as error:
+        pytest.skip(f"no multicast here: {error}")
+    rates = bus_rates(url, 5)
+    assert set(rates) == {"bridge", "send", "plain send", "recv", "plain recv"}
+    assert all(rate > 0 for rate in rates.values())
+
+
+def test_a_closed_path_is_measured() -> None:
+    assert closed_in_process(0.05) > 0

@@ -10,8 +10,7 @@ from runs import echelon, kill_session, plan_of, start_echelon
 
 from bridge.bus import Bus, open_bus, resolve_url
 from bridge.frame import Frame, Host
-from bridge.native.host import NativeHost
-from bridge.odrive.host import ODriveHost
+from bridge.protocols import make_host
 from sim.drives_command import describe
 
 PATIENCE_S = 20.0
@@ -57,7 +56,7 @@ def test_a_host_turns_wheels_and_ctrl_c_ends_it(protocol: str) -> None:
     overrides = [f'robot.drive.protocol="{protocol}"', "can.watchdog=1.0", "can.bitrate=1000000"]
     plan = plan_of("lab", "can.path=closed", *overrides)
     robot = plan.robots[4]
-    host: Host = NativeHost(robot.drive, 4) if protocol == "native" else ODriveHost(robot.drive, 4)
+    host = make_host(robot)
     with own_bus() as bus:
         sets = [word for override in overrides for word in ("--set", override)]
         command = start_echelon("drives", "lab", *sets, "--can", bus.url)
@@ -95,9 +94,9 @@ def test_drives_that_nobody_could_hear(url: str) -> None:
 
 
 def test_what_there_is_to_command() -> None:
-    plan = plan_of("lab", "can.path=closed", 'formation.groups.g2.robot.drive.protocol="cia402"')
-    lines = describe(plan, ["socketcan:can3"])
+    lines = describe(plan_of("lab", "can.path=closed"), ["socketcan:can3"])
     assert lines[0] == "bus can0: socketcan:can3; to listen: candump can3"
     assert lines[2] == "  g1/r2  native on can0, command 0x101, feedback 0x181, status 0x201"
-    assert lines[4] == "  g2/r4  cia402 on can0, nodes 1 right, 2 left"
     assert lines[-1] == "they report every 10 ms, and stop after 100 ms without a command"
+    lines = describe(plan_of("lab", "can.path=closed", 'robot.drive.protocol="cia402"'), ["socketcan:can3"])
+    assert lines[2] == "  g1/r2  cia402 on can0, nodes 3 right, 4 left"

@@ -123,22 +123,38 @@ def test_verdict_claims_and_numbers_are_on_the_page(single):
     assert "centroid within 0.05 of its largest error by 1 s, but it did not settle" in text
     assert "intra within 5 % 0.1 s 0.06 s holds" in text
     assert "centroid within 5 % 1 s never fails" in text
-    assert "load of 50 %, at most 150 %" in text
+    assert "loaded to 50 %." in text
     assert "In 7 frames a torque did not fit" in text
     assert "g1/r2 → g1" in text
 
 
-def test_the_bus_load_follows_from_the_bits_where_nobody_counted_it(run, tmp_path):
-    robots = {
-        "g1/r1": {"frames": 5, "stopped": {}, "clipped": 2, "torque_min": None},
-        "g1/r2": {"frames": 6, "clipped": 1},
+def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
+    identifier = {"frames": 5, "lost": 1, "destroyed": 2, "latency_mean": 1e-3, "latency_max": 2e-3}
+    buses = [
+        {
+            "name": "can0",
+            "bitrate": 500_000,
+            "load": 0.25,
+            "identifiers": {"100": identifier | {"latency_bound": 3e-3}, "101": identifier | {"latency_bound": None}},
+        }
+    ]
+    finding = {"time": 1.5, "bus": "can0", "id": "100", "kind": "gap", "text": "<late>", "robot": "g1/r1"}
+    can = {
+        "frames": 11,
+        "load_mean": 0.25,
+        "buses": buses,
+        "robots": {"g1/r1": {"protocol": "odrive", "stopped": {"rise limit": 3}, "fault": "right: hot"}},
+        "drives": {"robots": {"g1/r1": {"temperature": 71.25}}},
+        "referee": {"frames": 11, "kinds": {"gap": 1}, "findings": [finding]},
     }
-    can = {"frames": 11, "bits": 600_000, "robots": robots}
-    one = for_report(run, "bits")
+    one = for_report(run, "bus")
     text = rendered([replace(one, summary=one.summary | {"can": can})], tmp_path / "report.html").text
-    assert "a load of 20 %." in text  # 600,000 bit in 3 s of 1 Mbit/s
-    assert "In 3 frames a torque did not fit" in text
-    assert "g1/r1 5 2 g1/r2 6 1" in text
+    assert "loaded to 25 %." in text
+    assert "became zero before the bus: 3 times rise limit" in text
+    assert "100 5 1 2 1 2 3 101 5 1 2 1 2 –" in text
+    assert "g1/r1 odrive right: hot 3 rise limit 71.25" in text
+    assert "11 frames and found 1 gap" in text
+    assert "1.5 can0 100 gap <late>" in text
 
 
 def test_text_is_escaped(single):

@@ -35,7 +35,7 @@ TRIO = """
 name = "trio"
 duration = 1.0
 periods = { acceleration = 0.05, torque = 0.05 }
-can = { path = "closed", bring_up = 0.5, watchdog = 0.4 }
+can = { path = "closed", bring_up = 0.5, watchdog = 0.7 }
 trajectory = { kind = "line", velocity = [0.2, 0.0] }
 law = { epsilon = [0.5] }
 

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from bench.can import bus_rates
 from bridge.bridge import Bridge, Frame
 from bridge.bus import Bus, listen_command, open_bus, resolve_url
 from bridge.dbc import torque_dbc
 from bridge.native.codec import NativeCodec, Torque
+from sim.doctor import check_interfaces, check_vcan
 
 pytestmark = pytest.mark.vcan
 
@@ -172,6 +174,27 @@ def test_a_receiver_holds_a_burst(bus: Bus) -> None:
         got = [receiver.recv(10.0) for _ in sent]
     assert [frame and (frame.can_id, frame.data) for frame in got] == sent
     assert bus.recv(0.0) is None  # what it sent itself does not come back
+
+
+def test_the_way_to_the_bus_costs_no_more_than_twice_python_can() -> None:
+    rates = bus_rates("socketcan:vcan0", 100)
+    assert rates["bridge"] > rates["plain send"] / 2
+    assert rates["recv"] > rates["plain recv"] / 2
+
+
+def test_the_doctor_sees_interfaces() -> None:
+    ip("add", "vcan3", "type", "vcan")
+    try:
+        assert check_vcan().state == "ok"
+        assert check_vcan("vcan3").advice == ("sudo ip link set vcan3 up",)
+        found = {finding.what: finding for finding in check_interfaces()}
+        assert set(found) == {"vcan0", "vcan3"}
+        assert found["vcan0"].state == "ok"
+        assert found["vcan0"].text.startswith("vcan, queue of ")
+        assert found["vcan3"].text.startswith("vcan, down, queue of ")
+        assert found["vcan3"].advice == ("sudo ip link set vcan3 up",)
+    finally:
+        ip("del", "vcan3")
 
 
 def test_auto_is_this_interface() -> None:

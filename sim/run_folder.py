@@ -1,0 +1,72 @@
+"""Reads back the folder of a run, for reports and exports."""
+
+import json
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import cantools
+
+from bridge.canlog import Logged, read_log
+from bridge.plan_dbc import plan_dbc
+from echelon.load import ScenarioError, parse
+from echelon.plan import Plan
+from sim.recording import read_trace
+from sim.report import RunForReport
+from sim.usage import UsageError
+
+FRAMES: Final = 18
+"""So many frames a report shows, from run time 0 on."""
+
+
+def read_run(folder: Path) -> RunForReport:
+    """Reads a run's folder.  Raises UsageError."""
+    try:
+        toml = (folder / "scenario.toml").read_text(encoding="utf-8")
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        _, plan = parse(toml, str(folder / "scenario.toml"))
+        trace = read_trace(folder / "run.mcap", plan)
+    except OSError as error:
+        raise UsageError(f"{error.filename}: {error.strerror}") from None
+    except (ScenarioError, ValueError) as error:
+        raise UsageError(f"{folder}: {error}") from None
+    return RunForReport(folder.name, trace, summary, toml, first_frames(folder / "can.log", plan))
+
+
+def first_frames(path: Path, plan: Plan, count: int = FRAMES) -> tuple[dict[str, object], ...]:
+    """Returns the first frames of a run in its can.log, decoded by its DBC; none if there is no log."""
+    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
+    databases = {
+        bus.name: cantools.database.load_string(plan_dbc(plan, number), "dbc")
+        for number, bus in enumerate(plan.can.buses)
+    }
+    try:
+        running = (logged for logged in read_log(path) if logged.time_ns >= start_ns)
+        return tuple(_row(logged, databases.get(logged.channel), start_ns) for logged in islice(running, count))
+    except OSError:
+        return ()
+
+
+def _row(logged: Logged, database: Any, start_ns: int) -> dict[str, object]:
+    time_ns, channel, (can_id, data, remote) = logged
+    name, text = "", ""
+    try:
+        message = database.get_message_by_frame_id(can_id)
+        name = message.name
+        signals = message.decode(data, allow_truncated=True)
+        units = {signal.name: signal.unit or "" for signal in message.signals}
+        text = ", ".join(f"{signal} {_value(value)} {units[signal]}".rstrip() for signal, value in signals.items())
+    except Exception:  # a frame of nobody here, or one that says nothing
+        pass
+    content = "R" if remote else data.hex().upper()
+    return {
+        "t [s]": f"{(time_ns - start_ns) / 1e9:.6f}",
+        "bus": channel,
+        "frame": f"{can_id:03X}#{content}",
+        "message": name,
+        "says": text,
+    }
+
+
+def _value(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -110,7 +110,9 @@ class Watch:
                 return None
             return "burst", f"{(self.due_ns - begin_ns) / 1e6:.4g} ms before it was due"
         late_ns, told = busy_ns - self.due_ns, None
-        if self._catching_up and begin_ns - last_ns > self.half_ns:  # what it owes and did not send is lost
+        if self._catching_up and begin_ns - self.due_ns <= self.half_ns:
+            self._catching_up = False
+        elif self._catching_up and begin_ns - last_ns > self.half_ns:  # what it owes and did not send is lost
             self._catching_up = False
             periods = max(0, (busy_ns - self.due_ns + self.half_ns) // self.period_ns)
             self.due_ns = max(self.due_ns + periods * self.period_ns, busy_ns)
@@ -141,6 +143,11 @@ class Watch:
 
     def _late(self, late_ns: int, more: str = "") -> tuple[str, str]:
         return "gap", f"{late_ns / 1e6:.4g} ms late, its period is {self.period_ns / 1e6:g} ms{more}"
+
+    @property
+    def expected_ns(self) -> int | None:
+        """When the next one is due, or will be when the sender has caught up; None before the first."""
+        return None if self.due_ns is None else max(self.due_ns, self._begin_ns + self.period_ns)
 
     def forget(self) -> None:
         """Its sender begins anew."""

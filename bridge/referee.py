@@ -172,12 +172,13 @@ class Referee:
         """Tells which cyclic identifiers are silent, but for the one that has just come."""
         lane = self._lanes[bus]
         for watch in lane.cyclic():
-            if watch.due_ns is None or watch.silent or watch.can_id == can_id:
+            expected_ns = watch.expected_ns
+            if expected_ns is None or watch.silent or watch.can_id == can_id:
                 continue
             tolerance_ns = watch.tolerance_ns
             if not ended:
                 tolerance_ns = max(tolerance_ns, self._silence_ns + watch.period_ns)
-            late_ns = lane.busy_ns - watch.due_ns
+            late_ns = lane.busy_ns - expected_ns
             if late_ns > tolerance_ns:
                 watch.silent = True
                 text = f"nothing for {(late_ns + watch.period_ns) / 1e6:.4g} ms, its period is {watch.period_ns / 1e6:g} ms"

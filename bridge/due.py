@@ -104,7 +104,7 @@ class Watch:
         if self.due_ns is None:
             self.due_ns = begin_ns + self.period_ns
             return None
-        if self.due_ns - begin_ns > self.half_ns:
+        if self.due_ns - begin_ns > max(self.half_ns, self.tolerance_ns):
             if self._owed:
                 self._owed -= 1
                 return None

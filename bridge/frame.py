@@ -8,6 +8,7 @@ from collections import Counter
 from typing import NamedTuple, Protocol
 
 from bridge.motor import Fault, Motor
+from echelon.plan import DrivePlan
 
 
 class Frame(NamedTuple):
@@ -16,6 +17,13 @@ class Frame(NamedTuple):
     can_id: int
     data: bytes = b""
     remote: bool = False
+
+
+def recovers_after_ns(plan: DrivePlan, time_ns: int) -> int | None:
+    """Returns how long after a fault a host clears it; None: never.
+
+    Before run time 0, when drives are brought up, at once: they may be as an earlier run left them."""
+    return 0 if time_ns < 0 else plan.recover_ns
 
 
 class Drive(Protocol):

@@ -47,8 +47,8 @@ BOOT_UP: Final = b"\0"
 class Referee:
     """Listens to the buses of a plan.  Times are run times [ns]; times below zero are the bringing up of drives.
 
-    `tolerance_ns` is how late a cyclic frame may be, half its period unless given; live, where processes wait for their
-    turn, give more.  Raises ValueError for a negative one.
+    `tolerance_ns` is how late a cyclic frame may be, half its period unless given, and how early if that is more; live,
+    where processes wait for their turn, give more.  Raises ValueError for a negative one.
     """
 
     def __init__(self, plan: Plan, *, tolerance_ns: int | None = None) -> None:

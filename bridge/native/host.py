@@ -6,7 +6,7 @@ Pure: frames and the time in, frames out.  One command per cycle, whatever it sa
 from collections import Counter
 from typing import Final
 
-from bridge.frame import Frame
+from bridge.frame import Frame, recovers_after_ns
 from bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
@@ -80,7 +80,7 @@ class NativeHost:
         if self.torque_ns is not None and time_ns - self.torque_ns >= self._plan.watchdog_ns:
             self._states = _DISABLED
             self._fail(time_ns, SILENT)
-        recover_ns = self._plan.recover_ns
+        recover_ns = recovers_after_ns(self._plan, time_ns)
         waited = self._fault and recover_ns is not None and time_ns - self._fault_ns >= recover_ns
         if waited and self._started and self._clearing_ns is None:
             self._clearing_ns = time_ns

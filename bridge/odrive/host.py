@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
-from bridge.frame import Frame
+from bridge.frame import Frame, recovers_after_ns
 from bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
 from bridge.odrive.enums import AxisState, Command, ControlMode, InputMode, error_names
 from echelon.plan import DrivePlan
@@ -205,7 +205,8 @@ class ODriveHost:
             axis.asked_ns = None
 
     def _may_recover(self, axis: _Axis, time_ns: int) -> bool:
-        return self.plan.recover_ns is not None and time_ns - axis.fault_ns >= self.plan.recover_ns
+        after_ns = recovers_after_ns(self.plan, time_ns)
+        return after_ns is not None and time_ns - axis.fault_ns >= after_ns
 
     def _error(self, axis: _Axis, time_ns: int, errors: int) -> None:
         if not axis.errors:

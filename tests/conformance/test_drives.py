@@ -160,6 +160,8 @@ def enabled_rig(name: str, right: float = 0.5, left: float = -0.25, **changes: A
     """A rig whose wheels have these torques."""
     rig = make_rig(name, **changes)
     rig.bring_up()
+    while rig.time_ns < 0:  # the run begins
+        rig.cycle()
     rig.cycles(3, right, left)
     assert rig.torques() == pytest.approx([right, left], abs=rig.protocol.resolution(rig.plan))
     return rig
@@ -349,6 +351,21 @@ def test_after_a_fault_the_first_torque_must_be_zero(name: str) -> None:
         assert rig.torques()[0] == 0.0
         rig.time_ns += PERIOD_NS
     assert rig.refused() > refused
+
+
+def test_before_the_run_drives_are_brought_up_from_whatever_fault_they_are_in(name: str) -> None:
+    """An earlier run has left them so, say; and one that happens meanwhile is no reason not to begin."""
+    rig = make_rig(name, recover_ns=None)
+    rig.time_ns = -4 * CYCLES * PERIOD_NS
+    rig.bring_up()
+    rig.deaf = True
+    rig.cycles(WATCHDOG_NS // PERIOD_NS + NOTICE)
+    assert rig.host.fault
+    rig.deaf = False
+    while rig.time_ns < 0:
+        rig.cycle()
+        assert rig.torques() == [0.0, 0.0]
+    assert (rig.host.enabled, rig.host.fault) == (True, "")
 
 
 def test_watchdog_fault_recovers_too(name: str) -> None:

@@ -75,10 +75,10 @@ def as_processes(
     )
 
 
-def finished(run: subprocess.Popen[str], folder: Path, exits: tuple[int, ...] = (0,)) -> dict[str, Any]:
+def finished(run: subprocess.Popen[str], folder: Path, code: int = 0) -> dict[str, Any]:
     """Waits for the end of a run; returns its summary."""
     _, said = run.communicate(timeout=100)
-    assert run.returncode in exits, said
+    assert run.returncode == code, said
     assert "Traceback" not in said
     summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     return summary
@@ -182,7 +182,7 @@ def test_in_virtual_time_a_run_stands_still_with_its_interface(interface: str, t
     assert carried(interface) >= summary["can"]["frames"]
 
 
-def test_on_a_wall_clock_watchdogs_stop_wheels_without_an_interface(interface: str, trio: Path, tmp_path: Path) -> None:
+def test_on_a_wall_clock_watchdogs_stop_the_wheels(interface: str, trio: Path, tmp_path: Path) -> None:
     run = as_processes(trio, ("duration=4",), tmp_path / "run", interface, "--clock", "wall")
     with run:
         with listener(interface) as raw:
@@ -196,11 +196,14 @@ def test_on_a_wall_clock_watchdogs_stop_wheels_without_an_interface(interface: s
                 feedback = NativeCodec(0.001).decode_feedback(can_id, data)
                 if isinstance(feedback, Feedback) and can_id >= FEEDBACK_ID:
                     said[can_id] = feedback
-        summary = finished(run, tmp_path / "run", (0, 1))
+        summary = finished(run, tmp_path / "run", 1)
     for feedback in said.values():
         assert feedback.faults == (FaultCode.WATCHDOG, FaultCode.WATCHDOG)
         assert feedback.torques == (0.0, 0.0)
     can = summary["can"]
+    late = {found["robot"] for found in can["referee"]["findings"] if found["kind"] in ("gap", "silent")}
+    assert late == {"r1", "r2", "r3"}
+    assert not summary["verdict"]["holds"]
     assert can["failed"] > 0
     for robot in can["robots"].values():
         assert not robot["enabled"]

@@ -1,0 +1,74 @@
+"""One robot on a real bus in real time: its virtual drives, and its host in a thread."""
+
+import threading
+import time
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import tomlkit
+
+from bridge.bus import open_bus
+from bridge.frame import Frame
+from bridge.protocols import drive_places, make_drive, make_host
+from echelon.load import load
+from echelon.plan import Plan
+from tests.bench_drives import Bench
+from tests.trees import ROBOT, scenario
+
+TORQUES = (0.25, -0.5)
+
+
+def one_robot(folder: Path, protocol: str = "native", **can: Any) -> tuple[Path, Plan]:
+    """Writes the scenario of one robot with a closed torque path, 100 Hz; a machine that stands still is no fault."""
+    table = scenario(
+        (None,),
+        np.random.default_rng(1),
+        duration=1.0,
+        periods={"acceleration": 0.01, "torque": 0.01},
+        robot=ROBOT | {"torque_limit": 1.5, "drive": {"protocol": protocol}},
+        can={"path": "closed", "watchdog": 2.0, "torque_scale": 0.001} | can,
+        claims=[],
+    )
+    path = folder / "one.toml"
+    path.write_text(tomlkit.dumps(table))
+    return path, load(path)[1]
+
+
+class LiveRobot:
+    """Drives and host at work, until the context ends."""
+
+    def __init__(self, plan: Plan, url: str) -> None:
+        self._bench = Bench(url, [make_drive(plan, place) for place in drive_places(plan)])
+        self._host = make_host(plan.robots[0])
+        self._period_s = plan.robots[0].drive.period_ns / 1e9
+        self._bus = open_bus(url)
+        self._end = threading.Event()
+        self.enabled = threading.Event()
+        """Set when torques are commanded"""
+        self._thread = threading.Thread(target=self._serve, name="host", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._bench.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._end.set()
+        self._thread.join(10.0)
+        self._bus.close()
+        self._bench.__exit__(*exc)
+
+    def _serve(self) -> None:
+        next_s = time.monotonic()
+        while not self._end.is_set():
+            now_ns = time.monotonic_ns()
+            for can_id, data, remote in self._host.poll(now_ns) + self._host.command(now_ns, *TORQUES):
+                self._bus.send(can_id, data, remote=remote)
+            if self._host.enabled:
+                self.enabled.set()
+            next_s += self._period_s
+            while (wait_s := next_s - time.monotonic()) > 0:
+                received = self._bus.recv(wait_s)
+                if received is not None and received.can_id in self._host.identifiers:
+                    self._host.receive(time.monotonic_ns(), Frame(received.can_id, received.data, received.remote))

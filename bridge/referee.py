@@ -48,10 +48,11 @@ class Referee:
     """Listens to the buses of a plan.  Times are run times [ns]; times below zero are the bringing up of drives.
 
     `tolerance_ns` is how late a cyclic frame may be, half its period unless given, and how early if that is more; live,
-    where processes wait for their turn, give more.  Raises ValueError for a negative one.
+    where processes wait for their turn, give more.  Raises ValueError for a negative one.  `late`: drives may have been
+    enabled before anybody listened.
     """
 
-    def __init__(self, plan: Plan, *, tolerance_ns: int | None = None) -> None:
+    def __init__(self, plan: Plan, *, tolerance_ns: int | None = None, late: bool = False) -> None:
         if tolerance_ns is not None and tolerance_ns < 0:
             raise ValueError(f"tolerance must be 0 ns or more, not {tolerance_ns!r}")
         self.plan = plan
@@ -62,6 +63,7 @@ class Referee:
         self.kept: list[dict[str, Any]] = []
         """The first findings, ready for JSON"""
         self.robots = [WheelCheck(plan, robot) for robot in plan.robots]
+        self._late = late
         self._silence_ns = plan.can.watchdog_ns
         self._lanes = [Lane(plan, bus) for bus in range(len(plan.can.buses))]
         for robot in self.robots:
@@ -116,7 +118,9 @@ class Referee:
         for robot in watch.robots:
             found = robot.observer.observe(time_ns, frame)
             for finding in found:
-                if finding.kind != "torque after silence" or robot.silent(sampled_ns):
+                unheard = self._late and watch.frames == 1 and finding.kind == "enabled unasked"
+                waited = finding.kind == "torque after silence" and not robot.silent(sampled_ns)
+                if not unheard and not waited:
                     said.append(self._tell(bus, robot, finding))
             more, stops = robot.check(time_ns, sampled_ns)
             if stops and untimely is not None and untimely[0] == "burst":

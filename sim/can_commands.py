@@ -64,7 +64,7 @@ def can(arguments: argparse.Namespace, console: Console | None = None) -> int:
         return 0
     if live:
         buses = _open(_urls(plan, arguments.can))
-        table = CanTable(plan, Referee(plan), tuple(bus.url for bus in buses))
+        table = CanTable(plan, Referee(plan, late=True), tuple(bus.url for bus in buses))
         source = _listen(buses, arguments.seconds)
     else:
         assert folder is not None
@@ -115,12 +115,12 @@ def _judge_live(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
     tolerance = getattr(arguments, "tolerance", None)
     if tolerance is not None and not 0 <= tolerance < 1e9:
         raise UsageError(f"--tolerance {tolerance:g}: must be 0 s or more")
-    judge = Referee(plan, tolerance_ns=None if tolerance is None else round(tolerance * 1e9))
+    judge = Referee(plan, tolerance_ns=None if tolerance is None else round(tolerance * 1e9), late=True)
     buses = _open(_urls(plan, arguments.can))
     time_ns = 0
-    if not arguments.json:
-        print(f"listening on {', '.join(bus.url for bus in buses)}; Ctrl-C ends it", file=sys.stderr, flush=True)
     try:
+        if not arguments.json:
+            print(f"listening on {', '.join(bus.url for bus in buses)}; Ctrl-C ends it", file=sys.stderr, flush=True)
         for time_ns, number, frame in _listen(buses, arguments.seconds):
             known = len(judge.kept)
             found = judge.observe(time_ns, number, frame) if frame is not None else []

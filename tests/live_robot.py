@@ -9,6 +9,7 @@ import numpy as np
 import tomlkit
 
 from bridge.bus import open_bus
+from bridge.cia402.host import Master
 from bridge.frame import Frame
 from bridge.protocols import drive_places, make_drive, make_host
 from echelon.load import load
@@ -41,7 +42,9 @@ class LiveRobot:
     def __init__(self, plan: Plan, url: str) -> None:
         self._bench = Bench(url, [make_drive(plan, place) for place in drive_places(plan)])
         self._host = make_host(plan.robots[0])
-        self._period_s = plan.robots[0].drive.period_ns / 1e9
+        drive = plan.robots[0].drive
+        self._period_s = drive.period_ns / 1e9
+        self._master = Master(drive.period_ns, drive.watchdog_ns) if drive.protocol == "cia402" else None
         self._bus = open_bus(url)
         self._end = threading.Event()
         self.enabled = threading.Event()
@@ -63,7 +66,10 @@ class LiveRobot:
         next_s = time.monotonic()
         while not self._end.is_set():
             now_ns = time.monotonic_ns()
-            for can_id, data, remote in self._host.poll(now_ns) + self._host.command(now_ns, *TORQUES):
+            frames = self._host.poll(now_ns) + self._host.command(now_ns, *TORQUES)
+            if self._master is not None:
+                frames += [*self._master.poll(now_ns), self._master.sync()]
+            for can_id, data, remote in frames:
                 self._bus.send(can_id, data, remote=remote)
             if self._host.enabled:
                 self.enabled.set()

@@ -1,6 +1,7 @@
 """What the doctor finds: the real things here, and files as other machines have them."""
 
 import json
+import re
 import shutil
 import threading
 from pathlib import Path
@@ -47,9 +48,10 @@ def test_no_such_scenario() -> None:
 
 
 def test_zenoh_and_waking_are_measured() -> None:
+    found = {finding["what"]: finding for finding in json.loads(echelon("doctor", "--json").stdout)}
+    assert found["Zenoh"]["state"] == "ok"
+    assert re.fullmatch(r"sessions over tcp/127\.\S+:\d+, [1-9]\d* µs there and back", found["Zenoh"]["text"])
     measured = Measured()
-    assert doctor.check_zenoh(measured, rounds=20).state == "ok"
-    assert 0 < measured.round_trip_s < 1
     assert doctor.check_waking(measured).state in ("ok", "note")
     assert measured.jitter_s > 0
 
@@ -75,6 +77,8 @@ def test_a_check_that_hangs_or_raises_is_a_problem(monkeypatch: pytest.MonkeyPat
 def test_neither_vcan_nor_multicast_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "check_vcan", lambda: Finding("vcan0", "note", "not there"))
     monkeypatch.setattr(doctor, "check_multicast", lambda: Finding("multicast", "note", "not there"))
+    # a session in this process would be in the way of tests that fork
+    monkeypatch.setattr(doctor, "check_zenoh", lambda measured: Finding("Zenoh", "ok", "not tried"))
     findings = doctor.examine()
     assert [finding.what for finding in findings if finding.state == "problem"] == ["CAN bus"]
     assert doctor.text(findings).endswith("NOT USABLE: CAN bus")

@@ -8,8 +8,8 @@ Zenoh's thread also does the sending, so it must never wait: not for the main th
 role is put aside for it), and not for room to put a message (`mailbox.LEAD` bounds what may be on the way to a receiver
 that reads nothing; a session has room for 128 KiB).
 
-On a wall clock the main thread waits for each stage's inputs until the stage's deadline, counts what was late, and goes on
-with the newest it has.
+On a wall clock it is the same, but that the main thread wakes at each instant and each deadline, and that a stage whose
+deadline has come goes on with the newest it has, and counts what was late.
 """
 
 import threading
@@ -24,7 +24,7 @@ from echelon.mailbox import Mailbox
 from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.role import Role, Stage
-from echelon.session import Inbox, Publisher, Session
+from echelon.session import Publisher, Session
 from echelon.wire import WireError, data_key, decode, encode, join, watch_key
 
 STALL_S: Final = 1.0
@@ -107,7 +107,7 @@ class Runner:
         self._stopping = False  # asked to, by a signal
         self._idle = False  # the main thread waits and may be interrupted
 
-        # State of a lockstep.  Whoever holds the lock may touch the mailbox and move the role.
+        # Whoever holds the lock may touch the mailbox and move the role.
         self._lock = threading.Lock()
         self._aside: deque[bytes] = deque()  # what came while the main thread had the lock
         self._wake = threading.Event()  # there is something for the main thread
@@ -117,14 +117,13 @@ class Runner:
         self._moved = 0
         self._finished = False
         self._failure: BaseException | None = None
+        # On a wall clock: when run time 0 is, and how long after an instant each stage may wait.
+        self._start_ns: int | None = None
+        self._allowed_ns: list[int] = []
 
         inputs = {slot_input for stage in role.stages for slot_input in stage.inputs}
         keys = sorted(data_key(run, members[one.source].path, one.channel) for one in inputs)
-        self._inbox: Inbox | None = None
-        if virtual:
-            session.subscribe(keys, self._receive)
-        else:
-            self._inbox = session.inbox(keys)
+        session.subscribe(keys, self._receive if virtual else self._receive_paced)
 
     def lockstep(self, on_wait: OnWait) -> None:
         """Runs the plan in virtual time, as fast as messages come; `on_wait` is told of every wait beyond `STALL_S`."""
@@ -210,35 +209,78 @@ class Runner:
     def wall_clock(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
 
-        Within a period, stages have deadlines in the order of their levels; the last ends with the period.
+        Within a period, stages have deadlines in the order of their levels; the last ends with the period.  A stage runs as
+        soon as nothing it wants is missing, in the handler of what came last; at its deadline it runs with what there is.
         """
-        assert self._inbox is not None
         # Stations between robots and wheels take turns before and after the members.
         early, late = (3, 5) if self.plan.stations else (0, 3)
         levels = early + max(node.depth for node in self.plan.nodes) * 2 + late
-        mailbox, counts, take = self.mailbox, self.counts, self._inbox.take
-        for time_ns in range(0, self.plan.duration_ns + 1, self._tick_ns):
-            self._sleep_until(start_ns + time_ns)
-            for number, stage in self._stages:
-                if time_ns % stage.period_ns:
+        self._allowed_ns = [stage.period_ns * (early + stage.level) // levels for stage in self.role.stages]
+        self._start_ns = start_ns
+        while True:
+            with self._lock:
+                self._take_aside()
+                wake_ns = self._pace()
+            if self._failure is not None:
+                raise self._failure
+            if self._finished:
+                return
+            self._rest(wake_ns)
+
+    def _pace(self) -> int:
+        """Runs the stages whose time has come; returns when to come again if nothing is received until then [ns]."""
+        mailbox, counts, start_ns = self.mailbox, self.counts, self._start_ns
+        assert start_ns is not None
+        while not self._finished:
+            begins_ns = start_ns + self._time_ns
+            if time.monotonic_ns() < begins_ns:
+                return begins_ns
+            for number, stage in self._stages[self._at :]:
+                self._at = number
+                if self._time_ns % stage.period_ns:
                     continue
-                deadline_ns = start_ns + time_ns + stage.period_ns * (early + stage.level) // levels
-                for payload in take(0):
-                    self._deliver(payload)
-                while mailbox.missing(number, time_ns):
-                    left_ns = deadline_ns - time.monotonic_ns()
-                    if left_ns <= 0:
-                        counts.late += 1
-                        break
-                    for payload in take(left_ns * 1e-9):
-                        self._deliver(payload)
+                deadline_ns = begins_ns + self._allowed_ns[number]
+                if mailbox.missing(number, self._time_ns):
+                    if time.monotonic_ns() < deadline_ns:
+                        return deadline_ns
+                    counts.late += 1
                 counts.stages += 1
                 if stage.inputs:
                     counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns)
-                self._run_stage(number, stage, time_ns)
+                self._run_stage(number, stage, self._time_ns)
+            self._at = 0
+            self._time_ns += self._tick_ns
+            self._finished = self._time_ns > self.plan.duration_ns
             if self._watch is not None:
                 self._watch.close()
                 self._watch.send()
+        return start_ns + self._time_ns
+
+    def _receive_paced(self, payload: bytes) -> None:
+        """Takes a payload on a wall clock, in Zenoh's thread, and moves the role as far as that lets it."""
+        if not self._lock.acquire(blocking=False):
+            self._aside.append(payload)
+            self._wake.set()
+            return
+        try:
+            self._take_aside()
+            self._deliver(payload)
+            if self._start_ns is not None and self._failure is None:
+                self._pace()
+        except BaseException as error:  # nobody above would learn of it
+            self._failure = error
+            self._wake.set()
+        finally:
+            self._lock.release()
+
+    def _rest(self, until_ns: int) -> None:
+        """Sleeps until an instant of `time.monotonic_ns`, or until there is something for the main thread."""
+        self._idle = True
+        if self._stopping:
+            raise SystemExit(0)
+        self._wake.wait(max(0, until_ns - time.monotonic_ns()) * 1e-9)
+        self._wake.clear()
+        self._idle = False
 
     def stop(self) -> None:
         """Breaks the run off with SystemExit in the main thread, between two messages; for a signal handler there."""
@@ -282,13 +324,3 @@ class Runner:
             self.counts.refused[error.reason] = self.counts.refused.get(error.reason, 0) + 1
             return
         self.mailbox.deliver(message)
-
-    def _sleep_until(self, instant_ns: int) -> None:
-        """Sleeps until an instant of `time.monotonic_ns`, if that is still to come."""
-        self._idle = True
-        if self._stopping:
-            raise SystemExit(0)
-        left_ns = instant_ns - time.monotonic_ns()
-        if left_ns > 0:
-            time.sleep(left_ns * 1e-9)
-        self._idle = False

@@ -39,6 +39,8 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     words.close()
     body: Body
     try:
+        if not spec.virtual and spec.kind == "recorder":
+            os.nice(10)  # it has time, others have not
         if spec.kind == "recorder":
             from sim.watchers import run_recorder as body
         elif spec.kind == "referee":

@@ -38,12 +38,13 @@ OTHER_NODE: Final = 1
 
 
 class Mail:
-    """Robots' torques as they come, in Zenoh's thread; `fileno` becomes readable."""
+    """Robots' torques as they come, in Zenoh's thread; with `wakes`, `fileno` becomes readable."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, wakes: bool = True) -> None:
         self._size = message_size(plan, 0, Channel.TORQUE)
         self._robots = len(plan.robots)
         self._messages: deque[Message] = deque()
+        self._wakes = wakes
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self.refused: dict[str, int] = {}
 
@@ -59,14 +60,16 @@ class Mail:
             self.refused[error.reason] = self.refused.get(error.reason, 0) + 1
             return
         self._messages.append(message)
-        os.eventfd_write(self._wake, 1)
+        if self._wakes:
+            os.eventfd_write(self._wake, 1)
 
     def take(self) -> list[Message]:
         """Returns what has come."""
-        try:
-            os.eventfd_read(self._wake)
-        except BlockingIOError:
-            return []
+        if self._wakes:
+            try:
+                os.eventfd_read(self._wake)
+            except BlockingIOError:
+                return []
         return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def fileno(self) -> int:
@@ -103,6 +106,11 @@ class WallBridge:
         if self._told < self._cycle - 1 and self._cycle > 0:
             return at_ns - self._period_ns + self._period_ns // FEEDBACK_SHARE
         return at_ns
+
+    @property
+    def listens(self) -> bool:
+        """True while robots are to be told what drives report."""
+        return self._told < self._cycle - 1
 
     def torques(self, now_ns: int) -> None:
         """Takes robots' torques and sends them."""
@@ -213,7 +221,9 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         return time.monotonic_ns() - start_ns
 
     while True:
-        _wait([control, bridge.mail, *bridge.station.buses], bridge.due_ns - now())
+        # What drives say is of use when a period has ended; until then it can wait for the next torque.
+        buses = bridge.station.buses if bridge.listens else ()
+        _wait([control, bridge.mail, *buses], bridge.due_ns - now())
         bridge.frames(now())
         bridge.torques(now())
         bridge.pass_time(now())
@@ -237,12 +247,12 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
         buses = [open_bus(url) for url in spec.can_urls]
     except (ValueError, OSError) as error:
         raise StartError(str(error)) from None
-    bank, mail = DriveBank(spec.plan), Mail(spec.plan)
+    bank, mail = DriveBank(spec.plan), Mail(spec.plan, wakes=False)  # how shafts turn is early enough with the next frame
     session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in spec.plan.robots], mail.receive)
     start_ns = meet(spec, session, control)
     until_ns: int | None = None
     while until_ns is None or time.monotonic_ns() < until_ns:
-        serve(bank, buses, start_ns, [control, mail])
+        serve(bank, buses, start_ns, [control])
         for message in mail.take():
             bank.turn(time.monotonic_ns() - start_ns, message)
         if until_ns is None and control.poll():

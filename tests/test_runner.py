@@ -78,7 +78,7 @@ class Network:
 class Member:
     """A runner alone, with the test for its network: `said` is what it put, `batches` what it put for watchers."""
 
-    def __init__(self, plan: Plan, role: Role, *, virtual: bool = True, inbox: Any = None) -> None:
+    def __init__(self, plan: Plan, role: Role, *, virtual: bool = True) -> None:
         self.said: list[bytes] = []
         self.batches: list[bytes] = []
         self.data_gate, self.watch_gate = threading.Event(), threading.Event()
@@ -105,7 +105,7 @@ class Member:
 
             return SimpleNamespace(put=put)
 
-        session: Any = SimpleNamespace(subscribe=subscribe, publisher=publisher, inbox=lambda keys: inbox)
+        session: Any = SimpleNamespace(subscribe=subscribe, publisher=publisher)
         self.runner = Runner(role, plan, session, RUN, watched=True, virtual=virtual)
         self.thread = threading.Thread(target=self._run, daemon=True)
 
@@ -351,29 +351,6 @@ class Clock:
         """Returns the time."""
         return self.now_ns
 
-    def sleep(self, seconds: float) -> None:
-        """Lets time pass."""
-        self.now_ns += round(seconds * 1e9)
-
-
-class TimedInbox:
-    """Payloads by the time at which they come."""
-
-    def __init__(self, clock: Clock, payloads: list[tuple[int, bytes]]) -> None:
-        self._clock, self._payloads = clock, deque(sorted(payloads, key=lambda each: each[0]))
-
-    def take(self, timeout_s: float | None = None) -> list[bytes]:
-        """Returns what has come; waits for the next as long as it may."""
-        assert timeout_s is not None
-        until_ns = self._clock.now_ns + round(timeout_s * 1e9)
-        coming = self._payloads[0][0] if self._payloads else until_ns
-        if coming > self._clock.now_ns and timeout_s:
-            self._clock.now_ns = min(until_ns, coming)
-        taken = []
-        while self._payloads and self._payloads[0][0] <= self._clock.now_ns:
-            taken.append(self._payloads.popleft()[1])
-        return taken
-
 
 def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int | None], Runner]:
     """Runs a robot's stages on a wall clock with commands that come `delay_of(number)` [ns] after their instant, or
@@ -397,9 +374,21 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int 
     role = make_role(plan, robot.index)
     stages: tuple[Stage, ...] = tuple(role.stages)
     stub: Any = SimpleNamespace(index=role.index, stages=(stages[0], replace(stages[1], run=move)))
+    coming = deque(sorted(payloads, key=lambda each: each[0]))
+
+    def rest(runner: Runner, until_ns: int) -> None:
+        """Lets time pass until something comes, which the handler takes, or to the end."""
+        if coming and coming[0][0] <= max(until_ns, clock.now_ns):
+            came_ns, payload = coming.popleft()
+            clock.now_ns = max(clock.now_ns, came_ns)
+            member.receive(payload)
+        else:
+            clock.now_ns = max(clock.now_ns, until_ns)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(echelon.runner, "time", clock)
-        member = Member(plan, stub, virtual=False, inbox=TimedInbox(clock, payloads))
+        patch.setattr(Runner, "_rest", rest)
+        member = Member(plan, stub, virtual=False)
         member.runner.wall_clock(start_ns)
     assert member.watched() == member.said
     assert clock.now_ns >= start_ns + plan.duration_ns

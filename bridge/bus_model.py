@@ -116,5 +116,11 @@ class BusModel(Protocol):
 
         Raises ValueError unless 0 <= rate <= 1."""
 
+    def is_off(self, node: int) -> bool:
+        """True if a node was off the bus at the last call's time."""
+
+    def clear(self, node: int) -> int:
+        """Loses what waits in a node's queue, but not a frame that is on the bus; returns how many frames that were."""
+
     def bus_off(self, node: int) -> None:
         """Takes a node off the bus at the last call's time; a frame of its own that is on the bus still gets through."""

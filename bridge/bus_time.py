@@ -22,7 +22,7 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
@@ -170,6 +170,20 @@ class BusTime(BusModel):
         if not 0 <= rate <= 1:
             raise ValueError(f"error rate must be 0 .. 1, not {rate!r}")
         self._rate = rate
+
+    def is_off(self, node: int) -> bool:
+        return node in self._off
+
+    def clear(self, node: int) -> int:
+        kept = [waiting for waiting in self._pending if waiting.node != node]
+        for waiting in self._pending:
+            if waiting.node == node:
+                self._traffic[waiting.frame.can_id].lost += 1
+        count = len(self._pending) - len(kept)
+        self._nodes[node].held -= count
+        self._pending = kept
+        heapify(self._pending)
+        return count
 
     def bus_off(self, node: int) -> None:
         if node not in self._off:
@@ -361,6 +375,12 @@ class IdealBus(BusModel):
     def set_error_rate(self, rate: float) -> None:
         if rate:
             raise ValueError(f"an ideal bus has no errors: its error rate must be 0, not {rate!r}")
+
+    def is_off(self, node: int) -> bool:
+        return False
+
+    def clear(self, node: int) -> int:
+        return 0
 
     def bus_off(self, node: int) -> None:
         raise ValueError(f"an ideal bus has no errors: node {node!r} cannot be off")

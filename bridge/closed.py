@@ -11,7 +11,7 @@ from bridge.bus_model import BusEventKind
 from bridge.canlog import CanLog
 from bridge.commander import Commander
 from bridge.fit import plan_fit
-from bridge.frame_message import BRIDGE_NODE, TimedFrame, unpack
+from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, unpack
 from bridge.on_bus import Rail, on_bus
 from bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.messages import Message
@@ -57,7 +57,7 @@ class ClosedStation:
 
     def note(self, message: Message) -> None:
         """Logs the frames of a message of the bridge's; shows them on the bus if nobody else does."""
-        frames = unpack(message.values)
+        frames = [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
         self.messages += 1
         if self.buses and not self._paired:
             self.rail.put(frames)

@@ -14,11 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from bridge.bus_load import worst_case_bits
 from bridge.bus_time import BusTime, IdealBus
 from bridge.cia402.host import Master
 from bridge.envelope import Envelope
 from bridge.frame import Frame, Host
-from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
+from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.protocols import drive_places, make_host
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import EventPlan, Plan, RobotPlan
@@ -108,6 +109,7 @@ class Commander:
         for robot in self.robots:
             listeners = self._listeners[robot.robot.drive.bus]
             listeners.update(dict.fromkeys(robot.host.identifiers, robot.host))
+        self._longest_ns = [-(-worst_case_bits(8) * 1_000_000_000 // bus.bitrate) for bus in plan.can.buses]
         self._masters = {
             bus: Master(self._period_ns, plan.can.watchdog_ns)
             for bus in range(len(self.buses))
@@ -150,15 +152,17 @@ class Commander:
         """Puts the frames of this cycle on the bus; returns all frames that the buses carry until the next one."""
         self.next_ns = time_ns + self._period_ns
         self.apply_events(time_ns)
+        emptied = self._empty_queues(time_ns)
         for robot, message in zip(self.robots, heard, strict=True):
             self._queue(time_ns, robot.robot.drive.bus, robot.frames(time_ns, message))
         end_ns = time_ns + self._period_ns
         for bus, master in self._masters.items():
             self._queue(time_ns, bus, master.poll(time_ns))
         for bus, master in self._masters.items():
-            sync = master.sync()
-            # It ends with the period, so that all drives sample then.
-            self._queue(end_ns - self.buses[bus].duration_ns(sync), bus, [sync])
+            # It ends with the period, so that all drives sample then, even if another frame has just begun.
+            sync, model = master.sync(), self.buses[bus]
+            lead_ns = model.duration_ns(sync) + (0 if isinstance(model, IdealBus) else self._longest_ns[bus])
+            self._queue(max(time_ns, end_ns - lead_ns), bus, [sync])
         carried = [
             TimedFrame(sent.end_ns, number, sent.node, sent.frame)
             for number, bus in enumerate(self.buses)
@@ -167,7 +171,19 @@ class Commander:
         if len(self.buses) > 1:
             carried.sort(key=lambda timed: timed.time_ns)
         sequence = (time_ns - self._first_ns) // self._period_ns
-        return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(carried)),)
+        return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(emptied + carried)),)
+
+    def _empty_queues(self, time_ns: int) -> list[TimedFrame]:
+        """Loses what controllers that are off their bus still held: it must not come when it is old.  Tells the drives."""
+        emptied = []
+        for number, bus in enumerate(self.buses):
+            if bus.is_off(BRIDGE_NODE):
+                bus.clear(BRIDGE_NODE)
+            for place in self._places:
+                if place.bus == number and bus.is_off(place.node):
+                    bus.clear(place.node)
+                    emptied.append(TimedFrame(time_ns, NO_BUS, place.node, Frame(0)))
+        return emptied
 
     def bus_frames(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Returns, bus by bus, what is sent once per period whatever robots there are; on a wall clock, at its start."""
@@ -179,8 +195,9 @@ class Commander:
 
     def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
         send = self.buses[bus].send
+        off = self.buses[bus].is_off(BRIDGE_NODE)
         for frame in frames:
-            if not send(time_ns, BRIDGE_NODE, frame):
+            if off or not send(time_ns, BRIDGE_NODE, frame):
                 self.lost[frame.can_id] += 1
 
     def apply_events(self, time_ns: int) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from bridge.frame import Drive, Frame
-from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
+from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.motor import Fault
 from bridge.protocols import DrivePlace, drive_places, make_drive
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
@@ -96,7 +96,9 @@ class DriveBank:
                 self.turn(time_ns, message)
         # Not those of an instant before, which a receiver holds when nothing newer comes.
         for timed in unpack(frames.values) if frames is not None and frames.time_ns == time_ns else ():
-            if timed.node != BRIDGE_NODE:
+            if timed.bus == NO_BUS:
+                self.drives[timed.node - 1].waiting = 0
+            elif timed.node != BRIDGE_NODE:
                 self.drives[timed.node - 1].waiting -= 1
             elif timed.bus < len(self._listeners):
                 for placed in self._listeners[timed.bus].get(timed.frame.can_id, ()):

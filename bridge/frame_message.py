@@ -14,6 +14,8 @@ from echelon.messages import Values
 
 BRIDGE_NODE: Final = 0
 """The bridge's number among the nodes of a bus; drives have those from 1 on."""
+NO_BUS: Final = 255
+"""Stands for the bus in what the bridge tells drives besides frames: that a node is off its bus, and its queue empty."""
 
 
 class TimedFrame(NamedTuple):

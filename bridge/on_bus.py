@@ -16,7 +16,7 @@ from typing import Final
 
 from bridge.bus import Bus
 from bridge.frame import Frame
-from bridge.frame_message import BRIDGE_NODE, TimedFrame, unpack
+from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, unpack
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 
@@ -78,7 +78,7 @@ def on_bus(
     """
 
     def split(message: Message) -> tuple[list[TimedFrame], list[TimedFrame]]:
-        frames = unpack(message.values)
+        frames = [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
         of_bridge = [timed for timed in frames if timed.node == BRIDGE_NODE]
         of_drives = [timed for timed in frames if timed.node != BRIDGE_NODE]
         return (of_bridge, of_drives) if is_bridge else (of_drives, of_bridge)

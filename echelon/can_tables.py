@@ -98,7 +98,7 @@ class Can(Table):
     """A drive that hears no torque, and a bridge that hears no robot, for so long take the torque away [s]"""
     bring_up: Positive = 1.0
     """How long before run time 0 the bridge begins to enable the drives [s]"""
-    queue: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 64
+    queue: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 256
     """Frames that may wait to be sent, in the bridge and in each drive, before further ones are lost"""
     restart: NonNegative = 0.1
     """How long a controller that went bus-off waits before it tries to come back [s]"""

@@ -159,6 +159,8 @@ def make_events(events: Iterable[Event], robots: Sequence[RobotPlan], can: CanPl
         key = f"events.{number}"
         if not can.closed:
             raise PlanError(f"{key}.kind = {event.kind!r}: needs can.path = 'closed'")
+        if event.kind in ("error_frames", "bus_off") and can.timing != "bits":
+            raise PlanError(f"{key}.kind = {event.kind!r}: needs can.timing = 'bits'")
         at_ns = round(event.at * 1e9)
         duration = getattr(event, "duration", None)
         until_ns = NEVER_NS if duration is None else at_ns + round(duration * 1e9)

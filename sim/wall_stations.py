@@ -94,6 +94,8 @@ class WallBridge:
         self._frames: list[TimedFrame] = []
         self._bits = [0] * len(plan.can.buses)
         self.latencies = array("q")
+        self.epoch_ns = 0
+        """When run time 0 is, since 1970"""
         self.in_time = 0
         session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in plan.robots], self.mail.receive)
         self._wheels = session.publisher(data_key(spec.run, plan.stations[0].path, Channel.WHEELS))
@@ -129,7 +131,8 @@ class WallBridge:
             while (received := bus.recv(0.0)) is not None:
                 frame = Frame(received.can_id, received.data, received.remote)
                 self._role.receive(now_ns, number, frame)
-                self._note(TimedFrame(now_ns, number, OTHER_NODE, frame))
+                came_ns = min(received.time_ns - self.epoch_ns, now_ns)  # as the kernel saw it
+                self._note(TimedFrame(came_ns, number, OTHER_NODE, frame))
 
     def pass_time(self, now_ns: int) -> None:
         """Does what is due: a new period, and telling robots of the one that ended."""
@@ -198,6 +201,7 @@ class WallBridge:
         """Logs the frames of a period, and shows them to those who watch."""
         if not self._frames:
             return
+        self._frames.sort(key=lambda timed: timed.time_ns)
         self.station.log(self._frames)
         if self._watch is not None:
             at_ns = self._frames[-1].time_ns
@@ -215,6 +219,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         raise StartError(str(error)) from None
     control.send(("bus", bridge.station.url))
     start_ns = meet(spec, session, control)
+    bridge.epoch_ns = _epoch_ns(start_ns)
     said_ns = 0
 
     def now() -> int:
@@ -247,7 +252,10 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
         buses = [open_bus(url) for url in spec.can_urls]
     except (ValueError, OSError) as error:
         raise StartError(str(error)) from None
-    bank, mail = DriveBank(spec.plan), Mail(spec.plan, wakes=False)  # how shafts turn is early enough with the next frame
+    bank, mail = (
+        DriveBank(spec.plan),
+        Mail(spec.plan, wakes=False),
+    )  # how shafts turn is early enough with the next frame
     session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in spec.plan.robots], mail.receive)
     start_ns = meet(spec, session, control)
     until_ns: int | None = None
@@ -276,16 +284,17 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -
     # Processes wait for their turn; only what a drive's watchdog would notice, too, is late.
     referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
     start_ns = meet(spec, session, control)
-    run_epoch_ns = time.time_ns() - time.monotonic_ns() + start_ns
+    epoch_ns = _epoch_ns(start_ns)
     while True:
         _wait([control, *buses], PROGRESS_NS)
         for number, bus in enumerate(buses):
             while (received := bus.recv(0.0)) is not None:
                 frame = Frame(received.can_id, received.data, received.remote)
-                referee.observe(received.time_ns - run_epoch_ns, number, frame)
+                referee.observe(received.time_ns - epoch_ns, number, frame)
         if control.poll():
             control.recv()
             break
+    referee.finish(time.monotonic_ns() - start_ns)
     for bus in buses:
         bus.close()
     cpu_s, resident = resources()
@@ -302,6 +311,11 @@ def serve(bank: DriveBank, buses: Sequence[Bus], start_ns: int, also: Sequence[A
             now_ns = time.monotonic_ns() - start_ns
             _send(buses, bank.receive(now_ns, number, Frame(received.can_id, received.data, received.remote)))
     _send(buses, bank.pass_time(time.monotonic_ns() - start_ns))
+
+
+def _epoch_ns(start_ns: int) -> int:
+    """Returns the instant since 1970 of an instant of the monotonic clock."""
+    return time.time_ns() - time.monotonic_ns() + start_ns
 
 
 def _send(buses: Sequence[Bus], frames: Sequence[TimedFrame]) -> None:

@@ -256,8 +256,40 @@ def test_disturbed_frames_are_sent_again_and_a_controller_that_is_off_comes_back
     assert kinds[:2] == ["bus-off", "recovered"]
     from_bridge = sorted(timed.time_ns for source, timed in heard.frames if timed.node == BRIDGE_NODE)
     gap = np.diff(from_bridge).max()
-    assert 100 * MS < gap < 115 * MS  # can.restart, 128 times 11 bits, and the way to the next period
+    assert 100 * MS < gap < 125 * MS  # can.restart, 128 times 11 idle bits, and the way to the next period
+    # What waited meanwhile is lost and does not come late.
+    assert all(bus.traffic[0x100 + robot].latency_max_ns < 2 * PERIOD for robot in range(9))
+    assert bridge.lost[0x100] > 8
     assert heard.got[1900 * MS].any(axis=1).all()  # all were enabled again
+
+
+@pytest.mark.parametrize("kind", ["error_frames", "bus_off"])
+def test_one_disturbance_does_not_swing_on(kind: str) -> None:
+    """A SYNC that comes late must not make all later ones late."""
+    more = ", rate=0.5, duration=0.02" if kind == "error_frames" else ""
+    engine = ran(
+        closed(
+            f'events=[{{kind="{kind}", at=0.5{more}}}]',
+            "robot.drive.protocol=cia402",
+            "can.bitrate=1000000",
+            "robot.drive.recover_after=0.1",
+            duration=3,
+        ),
+        heard := Heard(),
+    )
+    for node in range(1, 19):
+        came = [timed.time_ns for source, timed in heard.frames if timed.frame.can_id == 0x280 + node and source == 13]
+        assert np.diff([time_ns for time_ns in came if time_ns > 2000 * MS]).max() < 1.5 * PERIOD
+    assert all(row["enabled"] for row in stations(engine)[0].summary().values())
+
+
+def test_a_drive_that_is_off_the_bus_comes_back_with_news_only() -> None:
+    heard = Heard()
+    engine = ran(closed('events=[{kind="bus_off", at=0.5, robot="g1/r1"}]', "robot.drive.recover_after=0.1"), heard)
+    bridge, drives = stations(engine)
+    assert bridge.buses[0].traffic[0x180].latency_max_ns < 2 * PERIOD
+    assert 0 <= drives.drives[0].waiting <= 2
+    assert bridge.robots[0].host.enabled
 
 
 def test_one_seed_one_run() -> None:

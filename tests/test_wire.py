@@ -128,7 +128,7 @@ def test_a_flipped_byte_of_the_header_never_passes_unseen(message, data):
         (b"\x02\x00" + VALID[2:], "schema version 2, here 1"),
         (b"\x02\x00", "schema version 2, here 1"),  # a later version may have a shorter header
         (b"\x02\x00\x77" + bytes(60), "schema version 2, here 1"),  # and other channels
-        (VALID[:2] + b"\x06" + VALID[3:], "unknown channel 6"),
+        (VALID[:2] + b"\x08" + VALID[3:], "unknown channel 8"),
         (VALID[:2] + b"\x00" + VALID[3:], "unknown channel 0"),
         (VALID[:3] + b"\x01" + VALID[4:], "reserved bytes are not zero"),
         (VALID[:28] + b"\x01" + VALID[29:], "reserved bytes are not zero"),

@@ -13,12 +13,10 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from bridge.bus_load import frame_bits, many_frame_bits
+from bridge.bus_load import BitCount
 from bridge.envelope import Envelope
 from bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
 from echelon.plan import EnvelopePlan
-
-_BLOCK = 1024
 
 Frame = tuple[int, bytes]
 """CAN identifier (11 bits) and data (8 bytes)."""
@@ -63,8 +61,6 @@ class Bridge:
         "_makers",
         "_names",
         "_period_ns",
-        "_sent_data",
-        "_sent_ids",
         "counts",
         "frames",
     )
@@ -90,9 +86,7 @@ class Bridge:
         self._makers = makers or {}
         self.counts = [RobotCounts() for _ in robots]
         self.frames = 0
-        self._bits = 0
-        self._sent_ids: list[int] = []  # of frames whose bits are not counted yet: many at once is ten times cheaper
-        self._sent_data = bytearray()
+        self._bits = BitCount()
 
     def encode(
         self, time_ns: int, robot: int, tau_right: float, tau_left: float, saturated: bool = False
@@ -145,16 +139,14 @@ class Bridge:
         self._counters[robot] += 1
         self.counts[robot].frames += 1
         self.frames += 1
-        self._sent_ids.append(can_id)
-        self._sent_data += data
-        if len(self._sent_ids) >= _BLOCK:
-            self._count_bits()
+        self._bits.add(can_id, data)
         return [(can_id, data)]
 
     def _send_made(self, robot: int, frames: list[Frame]) -> list[Frame]:
         self.counts[robot].frames += len(frames)
         self.frames += len(frames)
-        self._bits += sum(frame_bits(can_id, data) for can_id, data in frames)
+        for can_id, data in frames:
+            self._bits.add(can_id, data)
         return frames
 
     def stopped(self) -> Counter[str]:
@@ -164,13 +156,7 @@ class Bridge:
     @property
     def bits(self) -> int:
         """Bits that all frames so far would take on a real bus, stuff bits and interframe space included."""
-        self._count_bits()
-        return self._bits
-
-    def _count_bits(self) -> None:
-        self._bits += int(many_frame_bits(self._sent_ids, bytes(self._sent_data)).sum())
-        self._sent_ids.clear()
-        self._sent_data.clear()
+        return self._bits.bits
 
     def summary(self) -> dict[str, Any]:
         """All counts, ready for JSON: totals, and one entry for each robot under its path name."""

@@ -266,12 +266,14 @@ class Bus:
         while True:
             try:
                 message = self._bus.recv(timeout)
-            except (can.CanError, OSError) as error:
+            except Exception as error:  # whatever python-can makes of a datagram that is none of its own
                 self.error = error
                 self.counts.recv_failed += 1
                 return None
             if message is None:
                 return None
+            if message.is_error_frame or message.is_fd or message.is_extended_id:
+                continue
             data = b"" if message.is_remote_frame else bytes(message.data)
             key = message.arbitration_id, data, message.is_remote_frame
             if self._echoes and (count := self._echoes.get(key)):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TAIL = 13  # delimiters, acknowledge, end of frame and interframe space: never stuffed
+_BLOCK = 1024
 _POLYNOMIAL = 0x4599  # CRC-15: x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
 
 
@@ -117,6 +118,38 @@ def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
         total += _ADDED[state, part]
         state = _AFTER[state, part]
     return total
+
+
+class BitCount:
+    """Adds up the bits of frames.  Those with eight bytes are counted many at once, which is ten times cheaper."""
+
+    __slots__ = ("_bits", "_data", "_ids")
+
+    def __init__(self) -> None:
+        self._bits = 0
+        self._ids: list[int] = []
+        self._data = bytearray()
+
+    def add(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Takes a frame.  Raises ValueError for one that is none."""
+        if len(data) != 8 or remote:
+            self._bits += frame_bits(can_id, data, remote)
+            return
+        self._ids.append(can_id)
+        self._data += data
+        if len(self._ids) >= _BLOCK:
+            self._count()
+
+    @property
+    def bits(self) -> int:
+        """Of all frames so far, stuff bits and interframe space included."""
+        self._count()
+        return self._bits
+
+    def _count(self) -> None:
+        self._bits += int(many_frame_bits(self._ids, bytes(self._data)).sum())
+        self._ids.clear()
+        self._data.clear()
 
 
 def worst_case_bits(length: int = 8) -> int:

@@ -21,6 +21,7 @@ from bridge.envelope import Envelope
 from bridge.frame import Frame, Host
 from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.protocols import drive_places, make_host
+from bridge.schedule import Schedule
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import EventPlan, Plan, RobotPlan
 from echelon.role import Input, Stage
@@ -52,14 +53,20 @@ class Torques:
         self.stopped: Counter[str] = Counter()
         self.commands = 0
         self.largest = 0.0
+        self._gave = False
         self.spoken = False
         """True once the robot has said something"""
 
     def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
         """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
         frames = self.host.poll(time_ns)
+        # What a host sends first when drives take torque (again) is zero, whatever is wanted; limits count from there.
+        gives, self._gave = self.host.enabled and self._gave, self.host.enabled
         tau_right = tau_left = saturated = 0.0
-        if heard is not None and heard.values[2] == 1.0:
+        commanded = heard is not None and heard.values[2] == 1.0
+        if commanded and not gives:
+            self.envelope.stop(time_ns)
+        elif heard is not None and commanded:
             tau_right, tau_left, _, saturated = heard.values[:4].tolist()
             tau_right, tau_left, reason = self.envelope.check(time_ns, heard.time_ns, tau_right, tau_left)
             if reason is not None:
@@ -116,8 +123,12 @@ class Commander:
             if any(robot.drive.protocol == "cia402" and robot.drive.bus == bus for robot in plan.robots)
         }
         self._places = drive_places(plan)
-        self._events = [event for event in plan.events if event.kind != "drive_fault"]
-        self._on: set[int] = set()
+        self._schedule = Schedule(event for event in plan.events if event.kind != "drive_fault")
+        self._stopped: set[int] = set()
+        """Robots under an e-stop"""
+        self._error_rates = [0.0] * len(self.buses)
+        self.refused: Counter[str] = Counter()
+        """What came as messages and cannot be"""
         self.lost: Counter[int] = Counter()
         """Frames of the bridge that its queue had no room for, by identifier"""
         deepest = max(node.depth for node in plan.nodes)
@@ -132,9 +143,11 @@ class Commander:
         """Takes the drives' frames of this instant; returns the torques of all wheels in the period that ends."""
         for message in heard:
             for at_ns, bus, node, frame in _fresh(message, time_ns):
-                if bus < len(self.buses):
-                    self.buses[bus].send(at_ns, node, frame)
-                    self.receive(at_ns, bus, frame)
+                if at_ns != time_ns or bus >= len(self.buses):
+                    self.refused["frame of no drive"] += 1
+                    continue
+                self.buses[bus].send(at_ns, node, frame)
+                self.receive(at_ns, bus, frame)
         return () if time_ns < 0 else (self.wheels(time_ns),)
 
     def receive(self, time_ns: int, bus: int, frame: Frame) -> None:
@@ -151,7 +164,8 @@ class Commander:
     def _send(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Puts the frames of this cycle on the bus; returns all frames that the buses carry until the next one."""
         self.next_ns = time_ns + self._period_ns
-        self.apply_events(time_ns)
+        for bus, frames in self.apply_events(time_ns):
+            self._queue(time_ns, bus, frames)
         emptied = self._empty_queues(time_ns)
         for robot, message in zip(self.robots, heard, strict=True):
             self._queue(time_ns, robot.robot.drive.bus, robot.frames(time_ns, message))
@@ -200,35 +214,35 @@ class Commander:
             if off or not send(time_ns, BRIDGE_NODE, frame):
                 self.lost[frame.can_id] += 1
 
-    def apply_events(self, time_ns: int) -> None:
-        """Makes happen what the scenario has for this instant."""
-        for number, event in enumerate(self._events):
-            on = event.at_ns <= time_ns < event.until_ns
-            if on == (number in self._on):
-                continue
-            self._on ^= {number}
-            if event.kind == "estop":
-                for robot in event.robots:
-                    self._estop(robot, time_ns, on)
-            elif event.kind == "error_frames":
-                for bus in event.buses:
-                    self.buses[bus].set_error_rate(event.rate if on else 0.0)
-            elif event.kind == "bus_off" and on:
+    def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
+        """Makes happen what the scenario has for this instant; returns the frames of an e-stop, bus by bus."""
+        frames = []
+        active, begun = self._schedule.at(time_ns)
+        stopped = {robot for event in active if event.kind == "estop" for robot in event.robots}
+        for robot in sorted(stopped - self._stopped):
+            torques = self.robots[robot]
+            frames.append((torques.robot.drive.bus, torques.host.stop(time_ns)))
+        for robot in self._stopped - stopped:
+            self.robots[robot].host.start()
+        self._stopped = stopped
+        for bus, model in enumerate(self.buses):
+            rate = max(
+                (event.rate for event in active if event.kind == "error_frames" and bus in event.buses), default=0.0
+            )
+            if rate != self._error_rates[bus]:
+                self._error_rates[bus] = rate
+                model.set_error_rate(rate)
+        for event in begun:
+            if event.kind == "bus_off":
                 for bus, node in self._nodes_of(event):
                     self.buses[bus].bus_off(node)
+        return frames
 
     def _nodes_of(self, event: EventPlan) -> list[tuple[int, int]]:
         """Returns bus and node of the controllers that an event is about: the bridge's, or those of robots' drives."""
         if not event.robots:
             return [(bus, BRIDGE_NODE) for bus in event.buses]
         return [(place.bus, place.node) for place in self._places if place.robot in event.robots]
-
-    def _estop(self, robot: int, time_ns: int, on: bool) -> None:
-        torques = self.robots[robot]
-        if on:
-            self._queue(time_ns, torques.robot.drive.bus, torques.host.stop(time_ns))
-        else:
-            torques.host.start()
 
     def summary(self) -> dict[str, Any]:
         """Returns what the bridge saw of every robot."""

@@ -7,17 +7,20 @@ turn as the robots say; the torque that reaches a robot is what its drives repor
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from bridge.frame import Drive, Frame
 from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.motor import Fault
 from bridge.protocols import DrivePlace, drive_places, make_drive
+from bridge.schedule import Schedule
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import NEVER_NS, Plan
 from echelon.role import Input, Stage
 
 _SPEED = TORQUE_FIELDS.index("speed_right")
+FASTEST: Final = 1e6
+"""Wheel speed that no wheel has [rad/s]"""
 
 
 class PlacedDrive:
@@ -53,8 +56,11 @@ class DriveBank:
         for placed in self.drives:
             for can_id in placed.drive.identifiers:
                 self._listeners[placed.place.bus].setdefault(can_id, []).append(placed)
-        self._events = [event for event in plan.events if event.kind == "drive_fault"]
-        self._on: set[int] = set()
+        self._schedule = Schedule(event for event in plan.events if event.kind == "drive_fault")
+        self._faults: set[tuple[int, int, str]] = set()
+        """Robot, wheel and fault of what is wrong on schedule"""
+        self.refused: Counter[str] = Counter()
+        """What came as messages and cannot be"""
         self._events_ns = drives.first_ns - 1
         self._of_robot: list[list[PlacedDrive]] = [[] for _ in plan.robots]
         for placed in self.drives:
@@ -96,10 +102,11 @@ class DriveBank:
                 self.turn(time_ns, message)
         # Not those of an instant before, which a receiver holds when nothing newer comes.
         for timed in unpack(frames.values) if frames is not None and frames.time_ns == time_ns else ():
-            if timed.bus == NO_BUS:
-                self.drives[timed.node - 1].waiting = 0
+            if not (time_ns <= timed.time_ns <= time_ns + self._period_ns and timed.node <= len(self.drives)):
+                self.refused["frame of no bus"] += 1
             elif timed.node != BRIDGE_NODE:
-                self.drives[timed.node - 1].waiting -= 1
+                placed = self.drives[timed.node - 1]
+                placed.waiting = 0 if timed.bus == NO_BUS else placed.waiting - 1
             elif timed.bus < len(self._listeners):
                 for placed in self._listeners[timed.bus].get(timed.frame.can_id, ()):
                     placed.take(timed.time_ns, timed.frame)
@@ -122,7 +129,11 @@ class DriveBank:
         for placed in self._of_robot[message.source]:
             placed.outbox += placed.drive.advance(time_ns)  # what was due before
             for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):
-                motor.set_speed(time_ns, float(message.values[_SPEED + wheel]))
+                speed = float(message.values[_SPEED + wheel])
+                if abs(speed) <= FASTEST:
+                    motor.set_speed(time_ns, speed)
+                else:  # of a robot whose numbers ran away
+                    self.refused["speed"] += 1
 
     def receive(self, time_ns: int, bus: int, frame: Frame) -> list[TimedFrame]:
         """Takes a frame from a bus; returns what the drives answer."""
@@ -149,25 +160,23 @@ class DriveBank:
 
     @property
     def _next_event_ns(self) -> int:
-        times = [at for event in self._events for at in (event.at_ns, event.until_ns)]
-        return min((at for at in times if at > self._events_ns), default=NEVER_NS)
+        next_ns = self._schedule.next_ns(self._events_ns)
+        return NEVER_NS if next_ns is None else next_ns
 
     def apply_events(self, time_ns: int) -> None:
         """Makes the scenario's faults happen that are due, and go away."""
         self._events_ns = time_ns
-        for number, event in enumerate(self._events):
-            on = event.at_ns <= time_ns < event.until_ns
-            if on == (number in self._on):
-                continue
-            self._on ^= {number}
-            for placed in self.drives:
-                if placed.place.robot not in event.robots:
-                    continue
-                for wheel in set(placed.place.wheels) & set(event.wheels):
-                    if on:
-                        placed.outbox += placed.drive.inject(time_ns, wheel, Fault(event.fault))
-                    else:
-                        placed.drive.mend(time_ns, wheel, Fault(event.fault))
+        active, _ = self._schedule.at(time_ns)
+        faults = {(robot, wheel, event.fault) for event in active for robot in event.robots for wheel in event.wheels}
+        for robot, wheel, fault in sorted(faults - self._faults):
+            placed = self._drive_of(robot, wheel)
+            placed.outbox += placed.drive.inject(time_ns, wheel, Fault(fault))
+        for robot, wheel, fault in sorted(self._faults - faults):
+            self._drive_of(robot, wheel).drive.mend(time_ns, wheel, Fault(fault))
+        self._faults = faults
+
+    def _drive_of(self, robot: int, wheel: int) -> PlacedDrive:
+        return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
     def summary(self) -> dict[str, Any]:
         """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""

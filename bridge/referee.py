@@ -212,8 +212,8 @@ def _shared(plan: Plan) -> Iterator[tuple[int, int, int]]:
         yield bus, HEARTBEAT_ID + HOST_NODE, heartbeat_ns(period_ns, plan.can.watchdog_ns)
 
 
-def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None) -> dict[str, Any]:
-    """Returns the referee's summary of a run's can.log.  A log that ends before the run should is silence.
+def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> dict[str, Any]:
+    """Returns the referee's summary of a run's can.log.  One that ends before the run should is silence, if it is `whole`.
 
     Raises OSError if it cannot be read."""
     referee = Referee(plan, tolerance_ns=tolerance_ns)
@@ -221,7 +221,7 @@ def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None) -> dic
     for time_ns, bus, frame in read_run_log(path, plan):
         last_ns = time_ns
         referee.observe(time_ns, bus, frame)
-    referee.finish(max(last_ns, plan.duration_ns))
+    referee.finish(max(last_ns, plan.duration_ns) if whole else last_ns)
     return referee.summary()
 
 

@@ -4,7 +4,21 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from echelon.values import Bitrate, Finite, Flag, Fraction, Limit, Name, NodeId, NonNegative, Positive, Table
+from echelon.values import (
+    Bitrate,
+    Constant,
+    ConstantOrZero,
+    Finite,
+    Flag,
+    Fraction,
+    Limit,
+    Name,
+    NodeId,
+    Positive,
+    Seconds,
+    SecondsOrZero,
+    Table,
+)
 
 
 class DriveTable(Table):
@@ -15,23 +29,23 @@ class DriveTable(Table):
     torque over CANopen)"""
     node_ids: tuple[NodeId, NodeId] | None = None
     """Of the right and the left wheel's drive; by default two numbers of the robot's own"""
-    recover_after: Positive | None = None
+    recover_after: Seconds | None = None
     """So long after a fault the bridge clears it and enables the drive anew [s]; never unless given"""
-    torque_limit: Positive | None = None
+    torque_limit: Constant | None = None
     """Largest torque of the motor [N m]; the robot's limit unless given"""
-    rated_torque: Positive | None = None
+    rated_torque: Constant | None = None
     """Torque that the motor can give for ever [N m]; CiA 402 counts in thousandths of it"""
     torque_slew: Limit | None = None
     """Largest change of torque [N m/s]"""
-    lag: NonNegative | None = None
+    lag: ConstantOrZero | None = None
     """Time constant of the current loop [s]"""
-    torque_constant: Positive | None = None
+    torque_constant: Constant | None = None
     """K_t [N m/A]"""
-    resistance: NonNegative | None = None
+    resistance: ConstantOrZero | None = None
     """Of the winding, which its current heats [Ω]"""
-    thermal_resistance: Positive | None = None
+    thermal_resistance: Constant | None = None
     """From winding to ambient [K/W]"""
-    thermal_time: Positive | None = None
+    thermal_time: Constant | None = None
     """Time constant of the winding's temperature [s]"""
     ambient: Finite | None = None
     """[°C]"""
@@ -39,17 +53,17 @@ class DriveTable(Table):
     """From this temperature on the torque limit falls [°C], linearly, to zero at `temperature_limit`"""
     temperature_limit: Finite | None = None
     """Over-temperature fault from here on [°C]"""
-    supply_voltage: Positive | None = None
+    supply_voltage: Constant | None = None
     """[V]"""
-    supply_resistance: NonNegative | None = None
+    supply_resistance: ConstantOrZero | None = None
     """Of battery and cables [Ω]"""
-    brown_out: NonNegative | None = None
+    brown_out: ConstantOrZero | None = None
     """Under this voltage the drive gives up [V]"""
     encoder_counts: Annotated[int, Field(strict=True, ge=1, le=1 << 24)] | None = None
     """Per revolution of the wheel"""
-    inertia: Positive | None = None
+    inertia: Constant | None = None
     """Of a wheel on a bench, where no robot turns it [kg m²]"""
-    friction: NonNegative | None = None
+    friction: ConstantOrZero | None = None
     """Of that wheel [N m s/rad]"""
 
 
@@ -64,7 +78,7 @@ class EnvelopeTable(Table):
     """Largest decrease of a torque's magnitude from frame to frame [N m]"""
     window_limit: Limit | None = None
     """Largest difference between two torques within 250 ms [N m]"""
-    stale_after: Positive | None = None
+    stale_after: Seconds | None = None
     """Age from which on a robot's torque is not used any more [s]; `can.watchdog` unless given"""
 
 
@@ -94,13 +108,13 @@ class Can(Table):
     """How long frames take in virtual time on the closed path: as on a real bus, or no time at all"""
     virtual_drives: Flag = True
     """On the closed path: False leaves the bus to drives that are there already (wall clock only)"""
-    watchdog: Positive = 0.1
+    watchdog: Seconds = 0.1
     """A drive that hears no torque, and a bridge that hears no robot, for so long take the torque away [s]"""
-    bring_up: Positive = 1.0
+    bring_up: Seconds = 1.0
     """How long before run time 0 the bridge begins to enable the drives [s]"""
     queue: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 256
     """Frames that may wait to be sent, in the bridge and in each drive, before further ones are lost"""
-    restart: NonNegative = 0.1
+    restart: SecondsOrZero = 0.1
     """How long a controller that went bus-off waits before it tries to come back [s]"""
 
 
@@ -108,9 +122,9 @@ class DriveFault(Table):
     """A fault of a drive."""
 
     kind: Literal["drive_fault"]
-    at: NonNegative
+    at: SecondsOrZero
     """[s]"""
-    duration: Positive | None = None
+    duration: Seconds | None = None
     """Until its cause goes away [s]; never unless given.  What it latched stays latched until it is cleared"""
     robot: str = "**"
     """A path in the tree, which may hold `*` and `**`"""
@@ -122,8 +136,8 @@ class Estop(Table):
     """Emergency stop: the bridge takes the torque away and disables the drives, for good unless it has a `duration`."""
 
     kind: Literal["estop"]
-    at: NonNegative
-    duration: Positive | None = None
+    at: SecondsOrZero
+    duration: Seconds | None = None
     robot: str = "**"
 
 
@@ -131,8 +145,8 @@ class ErrorFrames(Table):
     """Disturbances on a bus: each attempt to send a frame is destroyed with a probability, and repeated (timing `bits`)."""
 
     kind: Literal["error_frames"]
-    at: NonNegative
-    duration: Positive | None = None
+    at: SecondsOrZero
+    duration: Seconds | None = None
     bus: Name | None = None
     """All buses unless given"""
     rate: Fraction
@@ -142,7 +156,7 @@ class BusOff(Table):
     """A CAN controller goes bus-off, and comes back after `can.restart` and 128 times 11 idle bits (timing `bits`)."""
 
     kind: Literal["bus_off"]
-    at: NonNegative
+    at: SecondsOrZero
     bus: Name | None = None
     robot: str | None = None
     """Whose drives' controllers; the bridge's unless given"""

@@ -44,6 +44,10 @@ def make_can(can: Can, cycle_ns: int) -> CanPlan:
     buses = [BusPlan(name, bus.url or can.url, bus.bitrate or can.bitrate) for name, bus in can.buses.items()] or [
         BusPlan(FIRST_BUS, can.url, can.bitrate)
     ]
+    if not can.virtual_drives and can.path != "closed":
+        raise PlanError("can.virtual_drives = false: needs can.path = 'closed'")
+    if can.path == "closed" and can.watchdog * 1e9 < 2 * cycle_ns:
+        raise PlanError(f"can.watchdog = {can.watchdog}: must be at least two torque periods, {2 * cycle_ns / 1e9} s")
     urls = [bus.url for bus in buses if bus.url not in ("auto", "virtual")]
     if twice := [url for url in urls if urls.count(url) > 1]:
         raise PlanError(f"can.buses: {twice[0]!r} is the url of more than one; each needs its own")
@@ -80,6 +84,10 @@ class DriveMaker:
             raise PlanError(
                 f"{key}.drive.derating_from = {motor['derating_from']}: must be less than temperature_limit = "
                 f"{motor['temperature_limit']}"
+            )
+        if protocol == "cia402" and not 1e-3 <= motor["rated_torque"] < 2**32 * 1e-3:
+            raise PlanError(
+                f"{key}.drive.rated_torque = {motor['rated_torque']}: CiA 402 says it in 32 bits of 0.001 N m"
             )
         plan = DrivePlan(
             protocol=protocol,

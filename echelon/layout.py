@@ -16,7 +16,7 @@ def message_size(plan: Plan, source: int, channel: Channel) -> int | None:
             return len(TORQUE_FIELDS)
         case Channel.WHEELS if one.role == "bridge":
             return 2 * len(plan.robots)
-        case Channel.FRAMES:
+        case Channel.FRAMES if one.role in ("bridge", "drives"):
             return None
     if not isinstance(one, NodePlan):
         raise ValueError(f"{one.name} says nothing on channel {channel.name}")
@@ -35,3 +35,19 @@ def sized(plan: Plan) -> Plan:
     """Returns a plan whose links say how many values their messages have."""
     links = (replace(link, size=message_size(plan, link.source, link.channel)) for link in plan.links)
     return replace(plan, links=tuple(links))
+
+
+def said_by(plan: Plan) -> dict[tuple[int, Channel], int | None]:
+    """Returns all that may be said in a run: by source and channel the number of values, None if it varies.
+
+    Where torque is mirrored, the bridge is no member: it says frames under the number after the last."""
+    found: dict[tuple[int, Channel], int | None] = {}
+    for one in plan.everyone:
+        for channel in Channel:
+            try:
+                found[one.index, channel] = message_size(plan, one.index, channel)
+            except ValueError:
+                pass
+    if not plan.stations:
+        found[len(plan.members), Channel.FRAMES] = None
+    return found

@@ -131,7 +131,7 @@ def _links(
     for at, rule in enumerate(rules):
         if at not in used:
             raise PlanError(_why_unused(rule, f"links.{at}", names, bool(stations)))
-    return (*links, *_shaft_links(robots, stations))
+    return (*links, *_shaft_links(robots, stations, can))
 
 
 def _torque_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan]) -> list[tuple[int, int, Channel, int]]:
@@ -140,14 +140,16 @@ def _torque_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan]) 
     return [(robot.index, to.index, Channel.TORQUE, to.period_ns) for to in bridge for robot in robots]
 
 
-def _shaft_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan]) -> list[LinkPlan]:
+def _shaft_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan], can: CanPlan) -> list[LinkPlan]:
     """Returns the links that stand for no network: shafts, and what the bus itself does (bridge.bus_time)."""
     links: list[LinkPlan] = []
     if not stations:
         return links
     bridge, drives = stations[0].index, [station.index for station in stations[1:]]
     period_ns, first_ns = stations[0].period_ns, stations[0].first_ns
-    links += [LinkPlan(bridge, robot.index, Channel.WHEELS, period_ns) for robot in robots]
+    # A plant whose bridge says nothing has no torque: its drives have stopped by then.
+    stop = {"policy": "hold_then_stop", "timeout_ns": max(can.watchdog_ns, 2 * period_ns)}
+    links += [LinkPlan(bridge, robot.index, Channel.WHEELS, period_ns, **stop) for robot in robots]  # type: ignore[arg-type]
     for index in drives:
         links.append(LinkPlan(bridge, index, Channel.FRAMES, period_ns, first_ns=first_ns))
         links.append(LinkPlan(index, bridge, Channel.FRAMES, period_ns, first_ns=first_ns))

@@ -25,7 +25,7 @@ from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.role import Role, Stage
 from echelon.session import Publisher, Session
-from echelon.wire import WireError, data_key, decode, encode, join, watch_key
+from echelon.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
 
 STALL_S: Final = 1.0
 """A lockstep that has not moved for so long says whom it waits for, and goes on waiting."""
@@ -321,6 +321,6 @@ class Runner:
         try:
             message = decode(payload)
         except WireError as error:
-            self.counts.refused[error.reason] = self.counts.refused.get(error.reason, 0) + 1
+            count_refusal(self.counts.refused, error.reason)
             return
         self.mailbox.deliver(message)

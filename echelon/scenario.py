@@ -21,6 +21,7 @@ from echelon.values import (
     NonNegative,
     Point,
     Positive,
+    Seconds,
     Table,
 )
 from echelon.values import number_or_table as _number_or_table
@@ -262,7 +263,7 @@ class LinkRule(Table):
     policy: Literal["hold", "hold_then_stop"] | None = None
     """What a receiver uses if nothing newer has come: the last that came, for ever or until it is older than `timeout`.
     Unless given: `hold` where torque is mirrored, `hold_then_stop` where the torque path is closed"""
-    timeout: Positive | None = None
+    timeout: Seconds | None = None
     """For `hold_then_stop` [s]; `can.watchdog` unless given"""
 
 

@@ -8,6 +8,12 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(strict=True, gt=0, le=1e6, allow_inf_nan=False)]
+"""A duration, or an instant, that is not absurd"""
+SecondsOrZero = Annotated[float, Field(strict=True, ge=0, le=1e6, allow_inf_nan=False)]
+Constant = Annotated[float, Field(strict=True, ge=1e-6, le=1e6, allow_inf_nan=False)]
+"""A property of a motor"""
+ConstantOrZero = Annotated[float, Field(strict=True, ge=0, le=1e6, allow_inf_nan=False)]
 Limit = Annotated[float, Field(strict=True, gt=0)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Flag = Annotated[bool, Field(strict=True)]

@@ -14,6 +14,8 @@ from echelon.messages import Channel, Message
 
 SCHEMA_VERSION: Final = 1
 HEADER: Final = struct.Struct("<HBBIQqII")
+REASONS: Final = 32
+"""Reasons that refusals are counted by."""
 _CHANNELS: Final = {int(channel): channel for channel in Channel}
 _LENGTH: Final = struct.Struct("<I")
 _VERSION: Final = struct.Struct("<H")
@@ -31,6 +33,13 @@ class WireError(ValueError):
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
+
+
+def count_refusal(counts: dict[str, int], reason: str) -> None:
+    """Counts a refusal by its reason; whoever sends garbage makes up no more than `REASONS` reasons."""
+    if reason not in counts and len(counts) >= REASONS:
+        reason = "other reasons"
+    counts[reason] = counts.get(reason, 0) + 1
 
 
 def encode(message: Message) -> bytes:

@@ -86,12 +86,22 @@ def can(arguments: argparse.Namespace, console: Console | None = None) -> int:
     return 0
 
 
+def _judge_run(folder: Path, plan: Plan) -> dict[str, Any]:
+    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Raises OSError."""
+    try:
+        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
+    except (OSError, ValueError, KeyError):
+        run = {}
+    tolerance_ns = plan.can.watchdog_ns // 2 if run.get("clock") == "wall" else None
+    return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=not run.get("failure"))
+
+
 def referee(arguments: argparse.Namespace) -> int:
     """`echelon referee`: 1 if something is found."""
     plan, folder = _plan_of(arguments)
     if folder is not None and arguments.can is None:
         try:
-            summary = judge_log(folder / LOG, plan)
+            summary = _judge_run(folder, plan)
         except OSError as error:
             raise UsageError(f"{folder / LOG}: {error.strerror}") from None
         said = len(summary["findings"])

@@ -95,7 +95,7 @@ def execute(
             stall_timeout_s=stall_timeout_s,
         ).run()
     if outcome.can and "referee" not in outcome.can:
-        outcome.can["referee"] = judged(folder / "can.log", plan, clock)
+        outcome.can["referee"] = judged(folder / "can.log", plan, clock, whole=not outcome.failure)
     display.close()
     summary = summarise(outcome.trace, outcome.links, outcome.can, _run_facts(plan, outcome, engine, clock))
     if outcome.failure:
@@ -106,12 +106,12 @@ def execute(
     return Finished(folder, summary, outcome.trace, outcome.failure)
 
 
-def judged(log: Path, plan: Plan, clock: str) -> dict[str, Any]:
+def judged(log: Path, plan: Plan, clock: str, whole: bool) -> dict[str, Any]:
     """Returns what the referee finds in a run's can.log."""
     from bridge.referee import judge_log
 
     tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
-    return judge_log(log, plan, tolerance_ns=tolerance_ns) | {"source": "can.log"}
+    return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole) | {"source": "can.log"}
 
 
 def _in_process(
@@ -175,8 +175,13 @@ def _in_process(
                 break
     except KeyboardInterrupt:
         failure = "interrupted"
+        if plan.stations:
+            station.rail.stopping.set()  # a bus that takes no frames is not waited for any more
     wall_s = time.monotonic() - begun_s
-    pass_on()
+    try:
+        pass_on()
+    except SystemExit:
+        pass
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)

@@ -2,6 +2,7 @@
 the lockstep, with their frames going over the real bus."""
 
 import gc
+import os
 import signal
 import threading
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import Any, Final
 from bridge.bus import open_bus
 from bridge.closed import ClosedStation
 from bridge.drive_bank import DriveBank
-from bridge.on_bus import Rail, on_bus
+from bridge.on_bus import BusError, Rail, on_bus
 from echelon.role import Role, Stage
 from echelon.runner import Runner
 from echelon.session import Session
@@ -78,6 +79,11 @@ def run_station(spec: ProcessSpec, session: Session, control: Connection) -> Non
     teller.start()
     try:
         runner.lockstep(lambda time_ns, sources: say(("waiting", time_ns, sources)))
+    except SystemExit:  # the run breaks off; what was counted so far is to be told
+        pass
+    except BusError as error:
+        say(("failed", str(error)))
+        raise SystemExit(1) from None
     finally:
         runner.finish()
         done.set()
@@ -88,6 +94,7 @@ def run_station(spec: ProcessSpec, session: Session, control: Connection) -> Non
     cpu_s, resident = resources()
     links = tuple(runner.mailbox.counts())
     say(("done", Result(spec.name, cpu_s, resident, runner.counts, links, station.result())))
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
     control.recv()
 
 

@@ -263,9 +263,16 @@ class Supervisor:
             if child.process.is_alive():
                 child.process.terminate()
         deadline_s = time.monotonic() + GRACE_S
+        # Bridge and drives tell what they counted before they go, and must be listened to.
+        while time.monotonic() < deadline_s and any(
+            child.process.is_alive() and child.result is None for child in members
+        ):
+            try:
+                self._serve(0.05)
+            except RunError:
+                pass  # why the run broke off is known already
         for child in members:
-            child.process.join(max(0.0, deadline_s - time.monotonic()))
-            if child.process.is_alive():
+            if child.process.is_alive() and child.result is None:
                 child.process.kill()
 
     def _finish_watchers(self, failure: str | None) -> str | None:

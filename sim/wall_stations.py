@@ -9,30 +9,36 @@ import select
 import time
 from array import array
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from heapq import heappop, heappush
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_load import frame_bits
+from bridge.bus import Bus, Received, open_bus
+from bridge.bus_load import BitCount
 from bridge.closed import ClosedStation
 from bridge.drive_bank import DriveBank
 from bridge.frame import Frame
 from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
 from bridge.referee import Referee
 from echelon.layout import message_size
+from echelon.link import Link
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.session import Session
-from echelon.wire import WireError, data_key, decode, encode, join, watch_key
+from echelon.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
 
 PROGRESS_NS: Final = 200_000_000
 FEEDBACK_SHARE: Final = 8
 """Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""
+AT_ONCE: Final = 256
+"""Frames taken from a bus before it is looked at what else there is to do."""
+OLDEST_NS: Final = 10_000_000_000
+"""Messages older than this are not of this run."""
 OTHER_NODE: Final = 1
 """What frames are noted as that others sent: which of them cannot be told from a frame."""
 
@@ -57,7 +63,7 @@ class Mail:
             if message.values.size != self._size:
                 raise WireError("wrong number of values")
         except WireError as error:
-            self.refused[error.reason] = self.refused.get(error.reason, 0) + 1
+            count_refusal(self.refused, error.reason)
             return
         self._messages.append(message)
         if self._wakes:
@@ -92,7 +98,16 @@ class WallBridge:
         self._cycle = -plan.can.bring_up_ns // self._period_ns
         self._told = -1
         self._frames: list[TimedFrame] = []
-        self._bits = [0] * len(plan.can.buses)
+        self._bits = [BitCount() for _ in plan.can.buses]
+        self._logged_ns = -1 << 62
+        everyone = plan.everyone
+        self._links = [
+            Link(link, plan.seed, everyone[link.source].name, everyone[link.receiver].name)
+            for link in plan.links
+            if link.channel is Channel.TORQUE and link.receiver == plan.stations[0].index
+        ]
+        self._flying: list[tuple[int, int, int, Message]] = []
+        self.link_lost = 0
         self.latencies = array("q")
         self.epoch_ns = 0
         """When run time 0 is, since 1970"""
@@ -106,8 +121,8 @@ class WallBridge:
         """When there is something to do without anything having come."""
         at_ns = self._cycle * self._period_ns
         if self._told < self._cycle - 1 and self._cycle > 0:
-            return at_ns - self._period_ns + self._period_ns // FEEDBACK_SHARE
-        return at_ns
+            at_ns += self._period_ns // FEEDBACK_SHARE - self._period_ns
+        return min(at_ns, self._flying[0][0]) if self._flying else at_ns
 
     @property
     def listens(self) -> bool:
@@ -115,20 +130,39 @@ class WallBridge:
         return self._told < self._cycle - 1
 
     def torques(self, now_ns: int) -> None:
-        """Takes robots' torques and sends them."""
+        """Takes robots' torques as their links let them arrive, and sends them."""
         for message in self.mail.take():
-            before = self._last[message.source]
-            if before is None or message.sequence > before.sequence:
-                self._last[message.source] = message
-                self._send_robot(now_ns, message.source, message.time_ns // self._period_ns)
-                latency_ns = now_ns - message.time_ns
-                self.latencies.append(latency_ns)
-                self.in_time += latency_ns < self._period_ns
+            if not self._plausible(now_ns, message):
+                count_refusal(self.mail.refused, "of another time")
+                continue
+            delay_ns = self._links[message.source].fate(message.sequence)
+            if delay_ns is None:
+                self.link_lost += 1
+            elif delay_ns == 0:
+                self._take(now_ns, message)
+            else:
+                heappush(self._flying, (message.time_ns + delay_ns, message.source, message.sequence, message))
+        while self._flying and self._flying[0][0] <= now_ns:
+            self._take(now_ns, heappop(self._flying)[-1])
+
+    def _plausible(self, now_ns: int, message: Message) -> bool:
+        """Holds a message against the clock: it is of a period of this run that has begun, and not long over."""
+        age_ns = now_ns - message.time_ns
+        return message.time_ns == message.sequence * self._period_ns and -self._period_ns <= age_ns <= OLDEST_NS
+
+    def _take(self, now_ns: int, message: Message) -> None:
+        before = self._last[message.source]
+        if before is None or message.sequence > before.sequence:
+            self._last[message.source] = message
+            self._send_robot(now_ns, message.source, message.time_ns // self._period_ns)
+            latency_ns = now_ns - message.time_ns
+            self.latencies.append(latency_ns)
+            self.in_time += latency_ns < self._period_ns
 
     def frames(self, now_ns: int) -> None:
         """Takes what has come from the buses."""
         for number, bus in enumerate(self.station.buses):
-            while (received := bus.recv(0.0)) is not None:
+            for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
                 self._role.receive(now_ns, number, frame)
                 came_ns = min(received.time_ns - self.epoch_ns, now_ns)  # as the kernel saw it
@@ -137,9 +171,11 @@ class WallBridge:
     def pass_time(self, now_ns: int) -> None:
         """Does what is due: a new period, and telling robots of the one that ended."""
         while now_ns >= self._cycle * self._period_ns:
+            for bus, frames in self._role.apply_events(now_ns):
+                for frame in frames:
+                    self._put(now_ns, bus, frame)
             for robot in range(len(self._last)):
                 self._send_robot(now_ns, robot, self._cycle - 1)  # again, if nothing newer came
-            self._role.apply_events(now_ns)
             for bus, frames in self._role.bus_frames(now_ns):
                 for frame in frames:
                     self._put(now_ns, bus, frame)
@@ -163,10 +199,9 @@ class WallBridge:
 
     def result(self) -> dict[str, Any]:
         """Returns what there is to say of the bridge; latencies [s] are from a robot's state to its torque frames."""
-        simulated_s = max(1, self._cycle * self._period_ns) / 1e9
         result = self.station.result()
-        for row, bits in zip(result["buses"], self._bits, strict=True):
-            row["load"] = bits / row["bitrate"] / simulated_s
+        for row, load in zip(result["buses"], self._loads(), strict=True):
+            row["load"] = load
         result["load_mean"] = max(row["load"] for row in result["buses"])
         latencies = np.array(self.latencies) / 1e9
         result["torque"] = {
@@ -178,7 +213,17 @@ class WallBridge:
             "latency_max": float(latencies.max()) if len(latencies) else None,
         }
         result["refused_messages"] = self.mail.refused
+        result["torque"]["lost_on_links"] = self.link_lost
         return result
+
+    def progress(self) -> dict[str, Any]:
+        """Returns what a live table shows."""
+        return self.station.progress() | {"load": max(self._loads())}
+
+    def _loads(self) -> list[float]:
+        """Returns the share of each bus that its frames took since drives are brought up."""
+        since_s = max(1, self._cycle * self._period_ns + self.plan.can.bring_up_ns) / 1e9
+        return [bits.bits / bus.bitrate / since_s for bits, bus in zip(self._bits, self.plan.can.buses, strict=True)]
 
     def _send_robot(self, now_ns: int, robot: int, cycle: int) -> None:
         """Sends the newest torque of a robot for a period, once: one that is late goes with the next period's."""
@@ -195,13 +240,16 @@ class WallBridge:
 
     def _note(self, timed: TimedFrame) -> None:
         self._frames.append(timed)
-        self._bits[timed.bus] += frame_bits(timed.frame.can_id, timed.frame.data)
+        self._bits[timed.bus].add(*timed.frame)
 
     def _flush(self) -> None:
         """Logs the frames of a period, and shows them to those who watch."""
         if not self._frames:
             return
+        # In order of time, also after what is logged already: a stamp may be older than what was written meanwhile.
         self._frames.sort(key=lambda timed: timed.time_ns)
+        self._frames = [timed._replace(time_ns=max(timed.time_ns, self._logged_ns)) for timed in self._frames]
+        self._logged_ns = self._frames[-1].time_ns
         self.station.log(self._frames)
         if self._watch is not None:
             at_ns = self._frames[-1].time_ns
@@ -220,7 +268,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     control.send(("bus", bridge.station.url))
     start_ns = meet(spec, session, control)
     bridge.epoch_ns = _epoch_ns(start_ns)
-    said_ns = 0
+    said_ns = now_ns = -1 << 62
 
     def now() -> int:
         return time.monotonic_ns() - start_ns
@@ -232,12 +280,13 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         bridge.frames(now())
         bridge.torques(now())
         bridge.pass_time(now())
-        if now() - said_ns >= PROGRESS_NS:
-            said_ns = now()
-            control.send(("progress", bridge.station.progress()))
-            if control.poll():
-                control.recv()
-                break
+        now_ns = now()
+        if now_ns - said_ns >= PROGRESS_NS:
+            said_ns = now_ns
+            control.send(("progress", bridge.progress()))
+        if control.poll():
+            control.recv()
+            break
     bridge.stop(now())
     bridge.frames(now())
     bridge.station.close()
@@ -288,7 +337,7 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -
     while True:
         _wait([control, *buses], PROGRESS_NS)
         for number, bus in enumerate(buses):
-            while (received := bus.recv(0.0)) is not None:
+            for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
                 referee.observe(received.time_ns - epoch_ns, number, frame)
         if control.poll():
@@ -307,10 +356,19 @@ def serve(bank: DriveBank, buses: Sequence[Bus], start_ns: int, also: Sequence[A
     """Waits for what comes next, a frame or an instant of the drives' own, and lets them work; `also` ends the wait too."""
     _wait([*also, *buses], bank.due_ns - (time.monotonic_ns() - start_ns))
     for number, bus in enumerate(buses):
-        while (received := bus.recv(0.0)) is not None:
+        for received in drained(bus):
             now_ns = time.monotonic_ns() - start_ns
             _send(buses, bank.receive(now_ns, number, Frame(received.can_id, received.data, received.remote)))
     _send(buses, bank.pass_time(time.monotonic_ns() - start_ns))
+
+
+def drained(bus: Bus) -> Iterator[Received]:
+    """Yields what has come from a bus, but no more than `AT_ONCE` frames: who babbles must not keep us from all else."""
+    for _ in range(AT_ONCE):
+        received = bus.recv(0.0)
+        if received is None:
+            return
+        yield received
 
 
 def _epoch_ns(start_ns: int) -> int:

@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Any, Final
 
 from bridge.frame_message import unpack
+from echelon.layout import said_by
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.session import Inbox, Session
-from echelon.wire import WireError, decode, encode, join, split, watch_key
+from echelon.wire import WireError, count_refusal, decode, encode, join, split, watch_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
 from sim.merge import TimeOrder
 from sim.recorder import Recorder
 from sim.trace import TraceBuilder
 
 PROGRESS_S: Final = 0.2
+SLACK_NS: Final = 60_000_000_000
+"""So long after its end a run on a wall clock may still say something."""
 HIGH_WATER: Final = 256
 """Batches a watcher may be behind before the run waits for it."""
 DRAIN_S: Final = 10.0
@@ -32,9 +35,11 @@ SILENCE_S: Final = 0.3
 class Reception:
     """Batches from the session, in one order of time."""
 
-    def __init__(self, inbox: Inbox, sources: Iterable[int]) -> None:
+    def __init__(self, inbox: Inbox, sources: Iterable[int], plan: Plan) -> None:
         self._inbox = inbox
         self._order = TimeOrder(sources)
+        self._sizes = said_by(plan)
+        self._from_ns, self._until_ns = -plan.can.bring_up_ns, plan.duration_ns + SLACK_NS
         self.refused: dict[str, int] = {}
 
     def take(self, timeout_s: float) -> list[Message]:
@@ -49,9 +54,16 @@ class Reception:
     def _unpack(self, batch: bytes) -> Iterator[Message]:
         try:
             for payload in split(batch):
-                yield decode(payload)
+                message = decode(payload)
+                size = self._sizes.get((message.source, message.channel), -1)
+                if size is not None and message.values.size not in (0, size):
+                    count_refusal(self.refused, "wrong number of values" if size >= 0 else "of nobody here")
+                elif self._from_ns <= message.time_ns <= self._until_ns:
+                    yield message
+                else:
+                    count_refusal(self.refused, "of another time")
         except WireError as error:
-            self.refused[error.reason] = self.refused.get(error.reason, 0) + 1
+            count_refusal(self.refused, error.reason)
 
     def drain(self, expected: int | None) -> Iterator[list[Message]]:
         """Yields what still comes at the end of a run: all that is `expected`, or (None) until it is silent."""
@@ -75,7 +87,7 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     # The bridge's messages come after the members'; drives say something of their own only where time is virtual.
     stations = len(plan.stations) if spec.virtual else 1
     sources = range(len(plan.members) + (stations if plan.stations else bool(spec.can_urls)))
-    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources)
+    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
     try:
         recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
     except OSError as error:
@@ -153,7 +165,7 @@ def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None
 
     plan = spec.plan
     robots = [robot.index for robot in plan.robots]
-    reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots)
+    reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots, plan)
     publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
     try:
         station = Station(plan, spec.can_urls, Path(spec.folder))

@@ -8,7 +8,8 @@ import pytest
 
 from bridge.commander import NOT_COMMANDED, Commander
 from bridge.drive_bank import DriveBank
-from bridge.frame_message import BRIDGE_NODE, unpack
+from bridge.frame import Frame
+from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from sim.engine import Engine
@@ -228,6 +229,84 @@ def test_an_estop_stops_its_robots_for_as_long_as_it_lasts() -> None:
     assert not any(row[:3].any() for time_ns, row in got.items() if 520 * MS < time_ns < 1000 * MS)
     assert any(row[:3].any() for time_ns, row in got.items() if time_ns > 1200 * MS)
     assert all(row[3:].any() for time_ns, row in got.items() if 520 * MS < time_ns < 1000 * MS)
+
+
+@pytest.mark.parametrize(
+    ("events", "stopped"),
+    [
+        ("{at=0.5}, {at=0.7, duration=0.2}", (500, 2000)),  # the end of one is not the end of the other
+        ("{at=0.5, duration=1.0}, {at=0.6, duration=0.1, robot='**/r1'}", (500, 1500)),
+        ("{at=0.501, duration=0.008}", (510, 520)),  # between two instants
+    ],
+)
+def test_estops_that_overlap_and_short_ones(events: str, stopped: tuple[int, int]) -> None:
+    heard = Heard()
+    ran(closed(f"events=[{events}]".replace("{at", "{kind='estop', at")), heard)
+    from_ms, until_ms = stopped
+    first = {time_ns // MS: np.abs(row[0]).max() for time_ns, row in heard.got.items()}
+    assert not any(tau for at, tau in first.items() if from_ms + 20 < at <= until_ms)
+    assert any(tau for at, tau in first.items() if from_ms - 200 < at <= from_ms)
+    if until_ms < 2000:
+        assert any(tau for at, tau in first.items() if at > until_ms + 50)
+    if until_ms == 520:
+        assert first[530] == 0  # it did happen
+
+
+def test_a_fault_that_two_events_cause_stays_until_both_are_over() -> None:
+    heard = Heard()
+    fault = 'kind="drive_fault", robot="g1/r1", fault="encoder_loss"'
+    events = f"events=[{{{fault}, at=0.3, duration=0.9}}, {{{fault}, at=0.5, duration=0.1}}]"
+    ran(closed(events, "robot.drive.recover_after=0.05"), heard)
+    first = {time_ns // MS: np.abs(row[0]).max() for time_ns, row in heard.got.items()}
+    assert not any(tau for at, tau in first.items() if 330 < at <= 1200)
+    assert any(tau for at, tau in first.items() if at > 1300)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_limits_of_the_envelope_count_from_the_zero_that_comes_first_after_a_fault(protocol: str) -> None:
+    """A robot that wants more than the rise limit when its drives come back must not get it in one step."""
+    heard = Heard()
+    engine = ran(
+        closed(
+            f"robot.drive.protocol={protocol}",
+            "can.timing=ideal",
+            "robot.envelope.rise_limit=0.004",
+            "robot.drive.recover_after=0.1",
+            "robot.torque_rate_limit=0.3",  # robots begin gently by themselves
+            'events=[{kind="drive_fault", robot="g1/r1", fault="encoder_loss", at=0.6, duration=0.01}]',
+        ),
+        heard,
+    )
+    got = np.array([heard.got[time_ns] for time_ns in sorted(heard.got)])
+    rises = np.diff(np.abs(got), axis=0)
+    assert rises.max() <= 0.004 + 1.6e-3  # and the rounding of a frame
+    assert np.abs(got[:60, 0]).max() > 0.02
+    assert stations(engine)[0].robots[0].stopped["rise limit"] > 0
+
+
+def test_messages_that_cannot_be_are_counted_and_nothing_else() -> None:
+    plan = closed("can.timing=ideal", duration=0.1)
+    engine = ran(plan)
+    bridge, drives = stations(engine)
+    serve = drives.stages[1]
+    time_ns = plan.duration_ns + PERIOD
+
+    def message(source: int, channel: Channel, values: Any) -> Message:
+        return Message(channel, source, 0, time_ns, values)
+
+    wrong = [
+        TimedFrame(2**62, 0, 0, Frame(0x100)),
+        TimedFrame(-1, 0, 0, Frame(0x100)),
+        TimedFrame(time_ns, 0, 999, Frame(1)),
+    ]
+    wrong.append(TimedFrame(time_ns, 255, 999, Frame(0)))
+    silly = [message(0, Channel.TORQUE, np.array([0, 0, 1, 0, speed, speed])) for speed in (np.nan, np.inf, 1e308)]
+    for torque in silly:
+        serve.run(time_ns, [message(drives.index, Channel.FRAMES, pack(wrong)), torque, *[None] * 8])
+    assert drives.refused == {"frame of no bus": 3 * len(wrong), "speed": 6}
+    bridge.stages[0].run(time_ns, [message(drives.index, Channel.FRAMES, pack([*wrong[:2], wrong[3]]))])
+    assert bridge.refused == {"frame of no drive": 3}
+    drives.stages[0].run(time_ns, [])
 
 
 def test_an_overloaded_bus_loses_frames_and_says_so() -> None:

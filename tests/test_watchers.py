@@ -43,7 +43,7 @@ def batches_by_source(messages: list[Message]) -> list[bytes]:
 
 def reception(inbox: Any) -> Reception:
     """Returns the reception of the paper's members."""
-    return Reception(inbox, range(len(paper().members)))
+    return Reception(inbox, range(len(paper().members)), paper())
 
 
 def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
@@ -63,13 +63,22 @@ def test_batches_come_out_in_order() -> None:
 def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
     messages = list(invented(paper(), TICKS))
     good = batches_by_source(messages)
-    stranger = batch([Message(Channel.STATE, 99, 0, 0, np.zeros(2))])
-    received = reception(Inbox([b"\x01", join([b"\x01\x00"]), good[0][:-1], stranger, *good[1:]]))
+    size = messages[0].values.size
+    stranger = batch([Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))])
+    odd = batch([Message(Channel.STATE, 1, 0, 0, np.zeros(2)), Message(Channel.STATE, 1, 0, 2**62, np.zeros(size))])
+    received = reception(Inbox([b"\x01", join([b"\x01\x00"]), good[0][:-1], stranger, odd, *good[1:]]))
     out = [each for portion in received.drain(None) for each in portion]
     missing = set(keys(messages)) - set(keys(out))
     assert missing == set(keys([each for each in messages if each.source == 0]))  # a batch goes whole or not at all
-    assert received.refused == {"batch cut in a length": 1, "too short": 1, "batch cut in a message": 1}
-    assert received.refused_count == 4
+    assert received.refused == {
+        "batch cut in a length": 1,
+        "too short": 1,
+        "batch cut in a message": 1,
+        "of nobody here": 2,
+        "wrong number of values": 1,
+        "of another time": 1,
+    }
+    assert received.refused_count == 7
 
 
 def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,7 +59,13 @@ def lab_in_process(*, whole: bool) -> float:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             display = Display(plan, quiet=True)
             done = execute(
-                scenario, plan, Path(folder), engine="inprocess", clock="virtual", can_urls=("virtual",), display=display
+                scenario,
+                plan,
+                Path(folder),
+                engine="inprocess",
+                clock="virtual",
+                can_urls=("virtual",),
+                display=display,
             )
         return float(done.summary["run"]["real_time_factor"])
     engine = Engine(plan)

@@ -16,7 +16,7 @@ from typing import Any
 from bridge.bus_load import BitCount
 from bridge.envelope import Envelope
 from bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
-from echelon.plan import EnvelopePlan
+from echelon.can_plan import EnvelopePlan
 
 Frame = tuple[int, bytes]
 """CAN identifier (11 bits) and data (8 bytes)."""

@@ -22,8 +22,9 @@ from bridge.frame import Frame, Host
 from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.protocols import drive_places, make_host
 from bridge.schedule import Schedule
+from echelon.can_plan import EventPlan
 from echelon.messages import Channel, Heard, Message
-from echelon.plan import EventPlan, Plan, RobotPlan
+from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage
 
 NOT_COMMANDED: Final = "no command"

@@ -14,8 +14,9 @@ from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.motor import Fault
 from bridge.protocols import DrivePlace, drive_places, make_drive
 from bridge.schedule import Schedule
+from echelon.can_plan import NEVER_NS
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
-from echelon.plan import NEVER_NS, Plan
+from echelon.plan import Plan
 from echelon.role import Input, Stage
 
 _SPEED = TORQUE_FIELDS.index("speed_right")

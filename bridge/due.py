@@ -22,7 +22,8 @@ from bridge.bus_load import worst_case_bits
 from bridge.cia402.codec import HEARTBEAT_ID, TPDO_IDS
 from bridge.frame import Frame
 from bridge.wheel_check import WheelCheck
-from echelon.plan import NEVER_NS, Plan
+from echelon.can_plan import NEVER_NS
+from echelon.plan import Plan
 
 SHIFT_NS: Final = 2_000_000
 SHIFTED: Final = 5

@@ -17,7 +17,7 @@ from collections import Counter, deque
 from enum import StrEnum
 from typing import NamedTuple
 
-from echelon.plan import EnvelopePlan
+from echelon.can_plan import EnvelopePlan
 
 WINDOW_NS = 250_000_000
 

@@ -8,7 +8,7 @@ from collections import Counter
 from typing import NamedTuple, Protocol
 
 from bridge.motor import Fault, Motor
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 
 class Frame(NamedTuple):

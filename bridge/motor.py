@@ -22,7 +22,7 @@ from enum import StrEnum
 from math import exp, expm1, floor, isfinite, sqrt, tau
 from typing import Final
 
-from echelon.plan import MotorPlan
+from echelon.can_plan import MotorPlan
 
 STEP_NS: Final = 10_000_000
 STEP: Final = STEP_NS * 1e-9

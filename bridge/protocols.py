@@ -6,7 +6,8 @@ from typing import Any, Final, NamedTuple
 
 from bridge.frame import Drive, Host
 from bridge.observe import Observer
-from echelon.plan import DrivePlan, Plan, RobotPlan
+from echelon.can_plan import DrivePlan
+from echelon.plan import Plan, RobotPlan
 
 PREFIX: Final = {"native": "Native", "odrive": "ODrive", "cia402": "Cia402"}
 """How the classes of a protocol begin; its modules are `bridge.<protocol>.host` and so on."""

@@ -33,7 +33,8 @@ from bridge.due import Lane
 from bridge.frame import Frame
 from bridge.observe import Finding, Observer
 from bridge.wheel_check import WheelCheck
-from echelon.plan import NEVER_NS, Plan
+from echelon.can_plan import NEVER_NS
+from echelon.plan import Plan
 
 KEPT: Final = 100
 """Findings that the summary tells in full"""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from echelon.plan import EventPlan
+from echelon.can_plan import EventPlan
 
 
 class Schedule:

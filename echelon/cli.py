@@ -19,6 +19,8 @@ a first look:
   echelon run paper                     the paper's nine robots, thirteen processes over Zenoh; a report to look at
   echelon run lab --clock wall          nine robots that could be built, in real time, torques on the CAN bus
   echelon run paper --set avoidance.enabled=true --out runs/avoiding
+  echelon run drives                    three drive protocols on three CAN buses; wheels get what came over the bus
+  echelon doctor lab                    what this machine can do, and whether the scenario fits it
   echelon validate my.toml              what is wrong with a scenario, in one line
 
 exit codes: 0 done and the verdict holds, 1 the verdict fails, 2 the input is wrong, 3 the run could not finish

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from math import ceil, inf
 from typing import Any, Final
 
+from echelon.can_plan import NEVER_NS, BusPlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan, MotorPlan
 from echelon.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop, Event
-from echelon.plan import NEVER_NS, BusPlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan, MotorPlan, PlanError, RobotPlan
+from echelon.plan import PlanError, RobotPlan
 from echelon.values import path_matches
 
 RAW_MAX: Final = 32767

@@ -6,8 +6,9 @@ from math import isfinite, radians
 from typing import Any, Final
 
 from echelon import shapes
+from echelon.can_plan import CanPlan
 from echelon.drives import DriveMaker, make_can
-from echelon.plan import CanPlan, NodePlan, PlanError, RobotPlan, ShapePlan
+from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.scenario import Group, RobotTable, Scenario, Shape
 
 ROBOT_DEFAULTS: Final[dict[str, Any]] = {

@@ -1,5 +1,6 @@
 """The plan: a scenario as the roles need it, with every default filled in, every wildcard resolved and every instant an
-integer of nanoseconds.  Plain frozen data: it is made once (`echelon.planning`) and handed to every process.
+integer of nanoseconds.  Plain frozen data: it is made once (`echelon.planning`) and handed to every process.  What concerns
+the CAN bus stands in `echelon.can_plan`.
 
 Members are numbered: robots first, in the order of the tree, then nodes, children before parents; the root is last.
 Blocks of the transformed state (theory.md section 2) stand in the order of their nodes, then the centroid.
@@ -11,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from echelon.can_plan import NEVER_NS, CanPlan, DrivePlan, EnvelopePlan, EventPlan, StationPlan
 from echelon.messages import Channel
 
 Array = NDArray[np.float64]
 COORDINATOR = "coordinator"
-NEVER_NS = 1 << 62
-"""Later than any instant of a run."""
 
 
 class PlanError(Exception):
@@ -44,8 +44,8 @@ class RobotPlan:
     wheel_speed_limit: float
     period_ns: int
     torque_period_ns: int
-    drive: "DrivePlan"
-    envelope: "EnvelopePlan"
+    drive: DrivePlan
+    envelope: EnvelopePlan
 
     @property
     def name(self) -> str:
@@ -56,81 +56,6 @@ class RobotPlan:
     def role(self) -> str:
         """`robot`"""
         return "robot"
-
-
-@dataclass(frozen=True, slots=True)
-class MotorPlan:
-    """The motor of a wheel and its power stage, SI units, temperatures in °C."""
-
-    torque_limit: float
-    """Largest shaft torque [N m]"""
-    rated_torque: float
-    """Torque it can give for ever [N m]; what CiA 402 counts in thousandths of"""
-    torque_slew: float
-    """Largest change of the setpoint [N m/s]"""
-    lag: float
-    """Time constant of the current loop [s]; 0: the torque follows at once"""
-    torque_constant: float
-    """K_t [N m/A]"""
-    resistance: float
-    """Of the winding [Ω]: it is heated by resistance · current²"""
-    thermal_resistance: float
-    """Winding to ambient [K/W]"""
-    thermal_time: float
-    """Time constant of the winding's temperature [s]"""
-    ambient: float
-    derating_from: float
-    """The torque limit falls linearly to zero from here to `temperature_limit`"""
-    temperature_limit: float
-    """Over-temperature fault from here on"""
-    supply_voltage: float
-    supply_resistance: float
-    """Of battery and cables [Ω]: the bus voltage falls with the current that the motor draws"""
-    brown_out: float
-    """Under this bus voltage the drive gives up [V]"""
-    encoder_counts: int
-    """Per revolution of the wheel"""
-    inertia: float
-    """What the motor turns where no robot does [kg m²]: a wheel on a bench"""
-    friction: float
-    """The same wheel's friction [N m s/rad]"""
-
-
-@dataclass(frozen=True, slots=True)
-class DrivePlan:
-    """The drives of a robot's wheels: their protocol, their place on the bus, their motor (both wheels have the same)."""
-
-    protocol: str
-    """`native`, `odrive` or `cia402`"""
-    bus: int
-    """Which of the plan's buses"""
-    node_ids: tuple[int, int]
-    """Of the right and the left wheel's drive; the robot's number, twice, for `native`"""
-    period_ns: int
-    """Between two torque frames, and between two feedback frames"""
-    watchdog_ns: int
-    """A drive that hears no command for so long stops, and stays stopped"""
-    torque_scale: float
-    """Of the native frame [N m per bit]"""
-    recover_ns: int | None
-    """So long after a fault the host clears it and enables the drive anew; None: never"""
-    motor: MotorPlan
-
-
-@dataclass(frozen=True, slots=True)
-class EnvelopePlan:
-    """What the last gate before the bus lets pass, for each wheel."""
-
-    torque_limit: float
-    """[N m]"""
-    rise_limit: float
-    """Largest growth of a torque's magnitude from frame to frame [N m]"""
-    fall_limit: float
-    """Largest decrease of a torque's magnitude from frame to frame [N m]"""
-    window_limit: float
-    """Largest difference between two torques within 250 ms [N m]"""
-    stale_ns: int
-    """Oldest command that may still become a frame"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,71 +160,6 @@ class LinkPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class BusPlan:
-    """A CAN bus: its name, where it is, how fast [bit/s]."""
-
-    name: str
-    url: str
-    bitrate: int
-
-
-@dataclass(frozen=True, slots=True)
-class CanPlan:
-    """The buses, and the way of the torques: `mirror` or `closed`, frames taking time as on a real bus (`bits`) or none."""
-
-    enabled: bool
-    buses: tuple[BusPlan, ...]
-    torque_scale: float
-    path: str
-    timing: str
-    virtual_drives: bool
-    watchdog_ns: int
-    bring_up_ns: int
-    queue: int
-    restart_ns: int
-
-    @property
-    def closed(self) -> bool:
-        """True if the plant takes its torque from the drives."""
-        return self.path == "closed"
-
-
-@dataclass(frozen=True, slots=True)
-class EventPlan:
-    """Something that happens from `at_ns` until `until_ns`: a kind and what it needs (echelon.can_tables)."""
-
-    kind: str
-    at_ns: int
-    until_ns: int
-    robots: tuple[int, ...] = ()
-    wheels: tuple[int, ...] = (0, 1)
-    fault: str = ""
-    buses: tuple[int, ...] = ()
-    rate: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class StationPlan:
-    """A process between robots and their wheels, on the closed torque path: the bridge, or the virtual drives."""
-
-    index: int
-    role: str
-    period_ns: int
-    first_ns: int
-    """When it begins, before the run: drives are brought up until 0"""
-
-    @property
-    def name(self) -> str:
-        """What people call it."""
-        return self.role
-
-    @property
-    def path(self) -> str:
-        """Its place among the keys, which no group can have."""
-        return f"@{self.role}"
-
-
-@dataclass(frozen=True, slots=True)
 class ClaimPlan:
     """What the run is expected to show: every block of `block` (a name or a layer) stays within `band` of its largest
     error from `settled_by` [s] on."""
@@ -349,7 +209,7 @@ class Plan:
         return (*self.robots, *self.nodes)
 
     @property
-    def everyone(self) -> "tuple[RobotPlan | NodePlan | StationPlan, ...]":
+    def everyone(self) -> tuple[RobotPlan | NodePlan | StationPlan, ...]:
         """Robots, nodes and stations by index."""
         return (*self.robots, *self.nodes, *self.stations)
 

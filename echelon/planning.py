@@ -11,22 +11,20 @@ from math import dist
 from typing import Final
 
 from echelon.blocks import fitting, make_blocks, make_coupling
+from echelon.can_plan import NEVER_NS, CanPlan, StationPlan
 from echelon.drives import make_events
 from echelon.layout import sized
 from echelon.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
 from echelon.messages import Channel
 from echelon.plan import (
     COORDINATOR,
-    NEVER_NS,
     AvoidancePlan,
-    CanPlan,
     ClaimPlan,
     LinkPlan,
     NodePlan,
     Plan,
     PlanError,
     RobotPlan,
-    StationPlan,
     TrajectoryPlan,
 )
 from echelon.scenario import LinkRule, Scenario, Uniform

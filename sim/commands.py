@@ -6,7 +6,6 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,105 +34,9 @@ def scenario_of(arguments: argparse.Namespace) -> tuple[Scenario, Plan]:
 
 def run(arguments: argparse.Namespace) -> int:
     """`echelon run`"""
-    if arguments.engine == "processes":
-        from sim.children import warm_up
+    from sim.run_command import run as work
 
-        warm_up()
-    scenario, plan = scenario_of(arguments)
-    from sim.live import Display
-    from sim.run import execute, new_folder
-    from sim.summary import summary_text
-
-    can_urls = _bus_urls(plan, arguments.can, arguments.engine == "inprocess")
-    if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
-        raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
-    if arguments.clock == "wall" and (kinds := {event.kind for event in plan.events} & {"error_frames", "bus_off"}):
-        raise UsageError(f"events of kind {min(kinds)!r}: what a real bus does nobody can order; needs --clock virtual")
-    if plan.can.closed and arguments.engine == "processes" and any(url.startswith("virtual") for url in can_urls):
-        raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
-    if arguments.clock == "virtual" and not plan.can.virtual_drives:
-        raise UsageError("can.virtual_drives = false: real drives need --clock wall")
-    try:
-        folder = new_folder(scenario, arguments.out)
-    except OSError as error:
-        raise UsageError(f"--out {arguments.out}: {error.strerror}") from None
-    display = Display(plan, quiet=arguments.quiet)
-    if not arguments.quiet:
-        display.say(_heading(plan, arguments, folder, can_urls))
-    try:
-        finished = execute(
-            scenario,
-            plan,
-            folder,
-            engine=arguments.engine,
-            clock=arguments.clock,
-            can_urls=can_urls,
-            display=display,
-            stall_timeout_s=arguments.stall_timeout,
-        )
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    except OSError as error:
-        print(f"echelon: {error.filename or folder}: {error.strerror or error}", file=sys.stderr)
-        return 3
-    finally:
-        display.close()
-    failure = finished.failure
-    if not arguments.no_report:
-        try:
-            _report([folder], folder / "report.html")
-        except (UsageError, OSError) as error:  # of a run that broke off there may be nothing to report
-            failure = failure or f"no report: {error}"
-    if arguments.json:
-        print(json.dumps(finished.summary, indent=2, allow_nan=False))
-    else:
-        print(summary_text(finished.summary))
-        print(f"  folder   {folder}")
-    if failure:
-        print(f"echelon: {failure}", file=sys.stderr)
-        return 3
-    return 0 if finished.summary["verdict"]["holds"] else 1
-
-
-def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_urls: Sequence[str]) -> str:
-    robots, nodes = len(plan.robots), len(plan.nodes)
-    how = "in one process" if arguments.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
-    bus = f", frames on {', '.join(can_urls)}" if can_urls else ""
-    path = f", {plan.can.path} torque path" if plan.can.closed else ""
-    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{path}{bus}; into {folder}"
-
-
-def _bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:
-    """Returns where each of the plan's buses is, in full; none if there are to be no frames.  Raises UsageError.
-
-    `wanted` is what --can says: a URL for all buses, or one for each, with commas between."""
-    if wanted == "none" or not (plan.can.enabled or wanted):
-        return ()
-    urls = [bus.url for bus in plan.can.buses]
-    if wanted:
-        given = wanted.split(",")
-        if len(given) not in (1, len(urls)):
-            raise UsageError(f"--can {wanted}: {len(given)} of them for {len(urls)} buses")
-        urls = given * len(urls) if len(given) == 1 else given
-    if one_process:  # it needs no bus to others; name one to be heard
-        urls = [f"virtual:{bus.name}" if url == "auto" else url for url, bus in zip(urls, plan.can.buses, strict=True)]
-    resolved = tuple(_checked_bus(url, number) for number, url in enumerate(urls))
-    if len(set(resolved)) < len(resolved):
-        raise UsageError(f"--can {wanted or ','.join(urls)}: {len(resolved)} buses need as many places")
-    return resolved
-
-
-def _checked_bus(url: str, number: int = 0) -> str:
-    from bridge.bus import interface_is_up, resolve_url
-
-    try:
-        resolved = resolve_url(url, number)
-    except ValueError as error:
-        raise UsageError(f"--can {url}: {error}") from None
-    kind, _, name = resolved.partition(":")
-    if kind == "socketcan" and not interface_is_up(name):
-        raise UsageError(f"--can {url}: there is no network interface {name} that is up")
-    return resolved
+    return work(arguments)
 
 
 def validate(arguments: argparse.Namespace) -> int:
@@ -163,11 +66,12 @@ def validate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _report(folders: list[Path], path: Path) -> None:
-    from sim.report import write_report
+def write_report(folders: list[Path], path: Path) -> None:
+    """Writes a report of runs.  Raises UsageError and OSError."""
+    from sim import report
     from sim.run_folder import read_run
 
-    write_report([read_run(folder) for folder in folders], path)
+    report.write_report([read_run(folder) for folder in folders], path)
 
 
 def report(arguments: argparse.Namespace) -> int:
@@ -175,7 +79,7 @@ def report(arguments: argparse.Namespace) -> int:
     folders = [Path(run) for run in arguments.runs]
     path = arguments.out or (folders[0] / "report.html" if len(folders) == 1 else Path("report.html"))
     try:
-        _report(folders, path)
+        write_report(folders, path)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     print(path)
@@ -232,11 +136,12 @@ def dbc(arguments: argparse.Namespace) -> int:
 
 def drives(arguments: argparse.Namespace) -> int:
     """`echelon drives`"""
+    from sim.bus_urls import bus_urls
     from sim.drives_command import run_drives
 
     arguments.set = [*(arguments.set or ()), "can.path=closed", "can.virtual_drives=true"]
     _, plan = scenario_of(arguments)
-    urls = _bus_urls(plan, arguments.can, False)
+    urls = bus_urls(plan, arguments.can, False)
     if not urls or any(url.startswith("virtual") for url in urls):
         raise UsageError("drives without a bus to others: give --can socketcan:vcan0, udp_multicast: or auto")
     try:

@@ -14,7 +14,7 @@ from bridge.bus import Bus, listen_command, open_bus
 from bridge.drive_bank import DriveBank
 from echelon.drives import identifiers
 from echelon.plan import Plan, RobotPlan
-from sim.wall_stations import serve
+from sim.wall_drives import serve
 
 LINE_S: Final = 1.0
 """Between two lines."""

@@ -44,7 +44,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         if spec.kind == "recorder":
             from sim.watchers import run_recorder as body
         elif spec.kind == "referee":
-            from sim.wall_stations import run_wall_referee as body
+            from sim.wall_drives import run_wall_referee as body
         elif spec.kind in ("bridge", "drives"):
             body = _station_body(spec)
         else:
@@ -84,9 +84,13 @@ def _station_body(spec: ProcessSpec) -> Body:
         from sim.stations import run_station
 
         return run_station
-    from sim.wall_stations import run_wall_bridge, run_wall_drives
+    if spec.kind == "bridge":
+        from sim.wall_bridge import run_wall_bridge
 
-    return run_wall_bridge if spec.kind == "bridge" else run_wall_drives
+        return run_wall_bridge
+    from sim.wall_drives import run_wall_drives
+
+    return run_wall_drives
 
 
 def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from bridge.bus import open_bus
 from bridge.frame import Drive, Frame
-from echelon.plan import DrivePlan, EnvelopePlan, MotorPlan
+from echelon.can_plan import DrivePlan, EnvelopePlan, MotorPlan
 
 MS = 1_000_000
 

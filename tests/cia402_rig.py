@@ -6,7 +6,7 @@ from typing import Any
 from bridge.cia402.drive import Cia402Drive
 from bridge.cia402.host import Cia402Host, Master
 from bridge.frame import Frame
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 from tests.bench_drives import MS, drive_plan
 
 NODES = (5, 6)

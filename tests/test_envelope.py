@@ -18,7 +18,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
 import bridge.envelope
 from bridge.envelope import Violation
-from echelon.plan import EnvelopePlan
+from echelon.can_plan import EnvelopePlan
 
 INF = math.inf
 MS = 1_000_000

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from bridge.motor import LATCHING, ON_DEMAND, STEP_NS, Fault, Motor
-from echelon.plan import MotorPlan
+from echelon.can_plan import MotorPlan
 from tests.bench_drives import MOTOR, MS, motor_plan
 
 K_T = MOTOR.torque_constant

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from bridge.cia402 import objects
 from bridge.cia402.codec import HOST_NODE, MODE_CYCLIC_TORQUE, RPDO_IDS, TPDO_IDS, milliseconds, rated_mnm
 from bridge.cia402.sdo import Key
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 
 def heartbeat_ns(period_ns: int, watchdog_ns: int) -> int:

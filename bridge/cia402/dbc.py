@@ -30,7 +30,7 @@ from bridge.cia402.codec import (
 )
 from bridge.cia402.configuration import heartbeat_ns
 from bridge.cia402.host import WHEELS
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 Choices = OrderedDict[int, str | NamedSignalValue]
 HOST = "bridge"

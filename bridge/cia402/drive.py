@@ -42,7 +42,7 @@ from bridge.cia402.pdo import Pdo
 from bridge.cia402.sdo import Key
 from bridge.frame import Frame
 from bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
-from echelon.plan import NEVER_NS, DrivePlan
+from echelon.can_plan import NEVER_NS, DrivePlan
 
 MODES: Final = (MODE_NONE, MODE_PROFILE_TORQUE, MODE_CYCLIC_TORQUE)
 _STAYS = (5, 6)

@@ -21,7 +21,7 @@ from bridge.cia402.codec import (
 from bridge.cia402.configuration import heartbeat_ns
 from bridge.cia402.wheel import Wheel
 from bridge.frame import Frame
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 WHEELS: Final = ("right", "left")
 

@@ -29,7 +29,7 @@ from bridge.cia402.pdo import COMMUNICATION, MAPPING, Pdo, check_change, pack, p
 from bridge.cia402.profile import Profile
 from bridge.cia402.sdo import LENGTH, Abort, Key, SdoError, SdoServer, abort_code
 from bridge.frame import Frame
-from echelon.plan import NEVER_NS
+from echelon.can_plan import NEVER_NS
 
 MS = 1_000_000
 _STATES = (objects.STATUSWORD, objects.MODE_DISPLAY, objects.ERROR_CODE, objects.ERROR_REGISTER)

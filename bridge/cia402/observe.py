@@ -37,7 +37,7 @@ from bridge.cia402.objects import CONTROLWORD, TARGET_TORQUE
 from bridge.cia402.sdo import LENGTH, written
 from bridge.frame import Frame
 from bridge.observe import Finding, WheelReading
-from echelon.plan import DrivePlan, EnvelopePlan
+from echelon.can_plan import DrivePlan, EnvelopePlan
 
 _LENGTHS: Final = {
     RPDO_IDS[0]: RPDO1.size,

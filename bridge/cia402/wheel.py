@@ -40,7 +40,7 @@ from bridge.cia402.codec import (
 from bridge.cia402.configuration import steps
 from bridge.cia402.sdo import Abort, SdoClient, name
 from bridge.frame import Frame, recovers_after_ns
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 _FAULT = "fault"
 _SILENT = "silent"

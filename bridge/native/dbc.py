@@ -29,7 +29,7 @@ from bridge.native.codec import (
     WheelState,
     frame_id,
 )
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 BRIDGE: Final = "bridge"
 """Who sends commands and takes feedback."""

@@ -25,7 +25,7 @@ from bridge.native.codec import (
     encode_status,
     frame_id,
 )
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 CODES: Final = {
     Fault.OVER_TEMPERATURE: FaultCode.OVER_TEMPERATURE,

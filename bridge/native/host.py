@@ -20,7 +20,7 @@ from bridge.native.codec import (
     decode_status,
     frame_id,
 )
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 SILENT: Final = "silent"
 REMOTE: Final = "remote"

@@ -19,7 +19,7 @@ from bridge.native.codec import (
     frame_id,
 )
 from bridge.observe import Finding, WheelReading
-from echelon.plan import DrivePlan, EnvelopePlan
+from echelon.can_plan import DrivePlan, EnvelopePlan
 
 WHEELS: Final = ("right", "left")
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from bridge.odrive.enums import Command
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 _NS = 1_000_000
 

@@ -11,7 +11,7 @@ from bridge.odrive.codec import MESSAGES, frame_id
 from bridge.odrive.codec import Message as Layout
 from bridge.odrive.config import ODriveConfig
 from bridge.odrive.enums import Command
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 HOST = "bridge"
 """Who sends commands"""

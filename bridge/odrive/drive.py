@@ -26,7 +26,7 @@ from bridge.odrive.enums import (
     ProcedureResult,
     RebootAction,
 )
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 VERSION: Final = (2, 0, 0, 0, 0, 6, 10, 0)
 """CANSimple 2, no real hardware, firmware 0.6.10"""

@@ -17,7 +17,7 @@ from typing import Final
 from bridge.frame import Frame, recovers_after_ns
 from bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
 from bridge.odrive.enums import AxisState, Command, ControlMode, InputMode, error_names
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 
 RETRY_NS: Final = 200_000_000
 """Two heartbeats: so long an answer may take"""

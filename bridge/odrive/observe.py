@@ -13,7 +13,7 @@ from bridge.observe import Finding, WheelReading
 from bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
 from bridge.odrive.config import ODriveConfig
 from bridge.odrive.enums import AxisState, Command, error_names
-from echelon.plan import DrivePlan, EnvelopePlan
+from echelon.can_plan import DrivePlan, EnvelopePlan
 
 ROUNDING: Final = 1e-6
 """Relative; more than a 32-bit float's"""

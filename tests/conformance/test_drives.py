@@ -22,7 +22,7 @@ from bridge.native.drive import NativeDrive
 from bridge.native.host import NativeHost
 from bridge.odrive.drive import ODriveDrive
 from bridge.odrive.host import ODriveHost
-from echelon.plan import DrivePlan
+from echelon.can_plan import DrivePlan
 from tests.bench_drives import MS, drive_plan, motor_plan
 
 WHEELS = (0, 1)

@@ -1,15 +1,11 @@
-"""The processes between robots and their wheels on a wall clock: the bridge and the virtual drives, each with its buses.
+"""The bridge on a wall clock.
 
-Both sleep until a frame, a robot's torque or an instant of their own comes.  A torque becomes frames as soon as it has
-come; a robot that says nothing in a period has its last torque sent again, until the envelope finds that too old.
+It sleeps until a frame, a robot's torque or an instant of its own comes.  A torque becomes frames as soon as it has come;
+a robot that says nothing in a period has its last torque sent again, until the envelope finds that too old.
 """
 
-import os
-import select
 import time
 from array import array
-from collections import deque
-from collections.abc import Iterator, Sequence
 from heapq import heappop, heappush
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -17,70 +13,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from bridge.bus import Bus, Received, open_bus
 from bridge.bus_load import BitCount
 from bridge.closed import ClosedStation
-from bridge.drive_bank import DriveBank
 from bridge.frame import Frame
 from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
-from bridge.referee import Referee
-from echelon.layout import message_size
 from echelon.link import Link
 from echelon.messages import Channel, Message
-from echelon.plan import Plan
 from echelon.session import Session
-from echelon.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
+from echelon.wire import count_refusal, data_key, encode, join, watch_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
+from sim.wall import PROGRESS_NS, Mail, drained, epoch_ns_of, wait_for
 
-PROGRESS_NS: Final = 200_000_000
 FEEDBACK_SHARE: Final = 8
 """Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""
-AT_ONCE: Final = 256
-"""Frames taken from a bus before it is looked at what else there is to do."""
 OLDEST_NS: Final = 10_000_000_000
 """Messages older than this are not of this run."""
 OTHER_NODE: Final = 1
 """What frames are noted as that others sent: which of them cannot be told from a frame."""
-
-
-class Mail:
-    """Robots' torques as they come, in Zenoh's thread; with `wakes`, `fileno` becomes readable."""
-
-    def __init__(self, plan: Plan, wakes: bool = True) -> None:
-        self._size = message_size(plan, 0, Channel.TORQUE)
-        self._robots = len(plan.robots)
-        self._messages: deque[Message] = deque()
-        self._wakes = wakes
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self.refused: dict[str, int] = {}
-
-    def receive(self, payload: bytes) -> None:
-        """Takes a payload."""
-        try:
-            message = decode(payload)
-            if message.channel is not Channel.TORQUE or message.source >= self._robots:
-                raise WireError("of no robot")
-            if message.values.size != self._size:
-                raise WireError("wrong number of values")
-        except WireError as error:
-            count_refusal(self.refused, error.reason)
-            return
-        self._messages.append(message)
-        if self._wakes:
-            os.eventfd_write(self._wake, 1)
-
-    def take(self) -> list[Message]:
-        """Returns what has come."""
-        if self._wakes:
-            try:
-                os.eventfd_read(self._wake)
-            except BlockingIOError:
-                return []
-        return [self._messages.popleft() for _ in range(len(self._messages))]
-
-    def fileno(self) -> int:
-        """For select."""
-        return self._wake
 
 
 class WallBridge:
@@ -267,7 +216,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         raise StartError(str(error)) from None
     control.send(("bus", bridge.station.url))
     start_ns = meet(spec, session, control)
-    bridge.epoch_ns = _epoch_ns(start_ns)
+    bridge.epoch_ns = epoch_ns_of(start_ns)
     said_ns = now_ns = -1 << 62
 
     def now() -> int:
@@ -276,7 +225,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     while True:
         # What drives say is of use when a period has ended; until then it can wait for the next torque.
         buses = bridge.station.buses if bridge.listens else ()
-        _wait([control, bridge.mail, *buses], bridge.due_ns - now())
+        wait_for([control, bridge.mail, *buses], bridge.due_ns - now())
         bridge.frames(now())
         bridge.torques(now())
         bridge.pass_time(now())
@@ -293,94 +242,3 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))
     control.recv()
-
-
-def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The process of the virtual drives of a run on a wall clock."""
-    try:
-        buses = [open_bus(url) for url in spec.can_urls]
-    except (ValueError, OSError) as error:
-        raise StartError(str(error)) from None
-    bank, mail = (
-        DriveBank(spec.plan),
-        Mail(spec.plan, wakes=False),
-    )  # how shafts turn is early enough with the next frame
-    session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in spec.plan.robots], mail.receive)
-    start_ns = meet(spec, session, control)
-    until_ns: int | None = None
-    while until_ns is None or time.monotonic_ns() < until_ns:
-        serve(bank, buses, start_ns, [control])
-        for message in mail.take():
-            bank.turn(time.monotonic_ns() - start_ns, message)
-        if until_ns is None and control.poll():
-            control.recv()
-            # Until the drives stopped by themselves if nobody stopped them.
-            until_ns = time.monotonic_ns() + (2 * spec.plan.can.watchdog_ns if bank.turning else 0)
-    for bus in buses:
-        bus.close()
-    cpu_s, resident = resources()
-    failed = sum(bus.counts.failed + bus.counts.dropped for bus in buses)
-    control.send(("done", Result(spec.name, cpu_s, resident, extra={"robots": bank.summary(), "failed": failed})))
-    control.recv()
-
-
-def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The process of the referee of a run on a wall clock: it hears the buses, and nobody else."""
-    try:
-        buses = [open_bus(url) for url in spec.can_urls]
-    except (ValueError, OSError) as error:
-        raise StartError(str(error)) from None
-    # Processes wait for their turn; only what a drive's watchdog would notice, too, is late.
-    referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
-    start_ns = meet(spec, session, control)
-    epoch_ns = _epoch_ns(start_ns)
-    while True:
-        _wait([control, *buses], PROGRESS_NS)
-        for number, bus in enumerate(buses):
-            for received in drained(bus):
-                frame = Frame(received.can_id, received.data, received.remote)
-                referee.observe(received.time_ns - epoch_ns, number, frame)
-        if control.poll():
-            control.recv()
-            break
-    referee.finish(time.monotonic_ns() - start_ns)
-    for bus in buses:
-        bus.close()
-    cpu_s, resident = resources()
-    extra = referee.summary() | {"source": "bus"}
-    control.send(("done", Result(spec.name, cpu_s, resident, extra=extra)))
-    control.recv()
-
-
-def serve(bank: DriveBank, buses: Sequence[Bus], start_ns: int, also: Sequence[Any] = ()) -> None:
-    """Waits for what comes next, a frame or an instant of the drives' own, and lets them work; `also` ends the wait too."""
-    _wait([*also, *buses], bank.due_ns - (time.monotonic_ns() - start_ns))
-    for number, bus in enumerate(buses):
-        for received in drained(bus):
-            now_ns = time.monotonic_ns() - start_ns
-            _send(buses, bank.receive(now_ns, number, Frame(received.can_id, received.data, received.remote)))
-    _send(buses, bank.pass_time(time.monotonic_ns() - start_ns))
-
-
-def drained(bus: Bus) -> Iterator[Received]:
-    """Yields what has come from a bus, but no more than `AT_ONCE` frames: who babbles must not keep us from all else."""
-    for _ in range(AT_ONCE):
-        received = bus.recv(0.0)
-        if received is None:
-            return
-        yield received
-
-
-def _epoch_ns(start_ns: int) -> int:
-    """Returns the instant since 1970 of an instant of the monotonic clock."""
-    return time.time_ns() - time.monotonic_ns() + start_ns
-
-
-def _send(buses: Sequence[Bus], frames: Sequence[TimedFrame]) -> None:
-    for _, bus, _, (can_id, data, remote) in frames:
-        buses[bus].send(can_id, data, remote=remote)
-
-
-def _wait(sources: Sequence[Any], left_ns: int) -> None:
-    """Sleeps until one of the sources is readable or the time is over."""
-    select.select(sources, (), (), min(max(left_ns, 0), PROGRESS_NS) * 1e-9)

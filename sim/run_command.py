@@ -1,0 +1,82 @@
+"""`echelon run`: from what the user typed to a run, its folder, and the exit code."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from echelon.plan import Plan
+from sim.commands import scenario_of, write_report
+from sim.usage import UsageError
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """`echelon run`"""
+    if arguments.engine == "processes":
+        from sim.children import warm_up
+
+        warm_up()
+    scenario, plan = scenario_of(arguments)
+    from sim.bus_urls import bus_urls
+    from sim.live import Display
+    from sim.run import execute, new_folder
+    from sim.summary import summary_text
+
+    can_urls = bus_urls(plan, arguments.can, arguments.engine == "inprocess")
+    if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
+        raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
+    if arguments.clock == "wall" and (kinds := {event.kind for event in plan.events} & {"error_frames", "bus_off"}):
+        raise UsageError(f"events of kind {min(kinds)!r}: what a real bus does nobody can order; needs --clock virtual")
+    if plan.can.closed and arguments.engine == "processes" and any(url.startswith("virtual") for url in can_urls):
+        raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
+    if arguments.clock == "virtual" and not plan.can.virtual_drives:
+        raise UsageError("can.virtual_drives = false: real drives need --clock wall")
+    try:
+        folder = new_folder(scenario, arguments.out)
+    except OSError as error:
+        raise UsageError(f"--out {arguments.out}: {error.strerror}") from None
+    display = Display(plan, quiet=arguments.quiet)
+    if not arguments.quiet:
+        display.say(_heading(plan, arguments, folder, can_urls))
+    try:
+        finished = execute(
+            scenario,
+            plan,
+            folder,
+            engine=arguments.engine,
+            clock=arguments.clock,
+            can_urls=can_urls,
+            display=display,
+            stall_timeout_s=arguments.stall_timeout,
+        )
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    except OSError as error:
+        print(f"echelon: {error.filename or folder}: {error.strerror or error}", file=sys.stderr)
+        return 3
+    finally:
+        display.close()
+    failure = finished.failure
+    if not arguments.no_report:
+        try:
+            write_report([folder], folder / "report.html")
+        except (UsageError, OSError) as error:  # of a run that broke off there may be nothing to report
+            failure = failure or f"no report: {error}"
+    if arguments.json:
+        print(json.dumps(finished.summary, indent=2, allow_nan=False))
+    else:
+        print(summary_text(finished.summary))
+        print(f"  folder   {folder}")
+    if failure:
+        print(f"echelon: {failure}", file=sys.stderr)
+        return 3
+    return 0 if finished.summary["verdict"]["holds"] else 1
+
+
+def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_urls: Sequence[str]) -> str:
+    robots, nodes = len(plan.robots), len(plan.nodes)
+    how = "in one process" if arguments.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
+    bus = f", frames on {', '.join(can_urls)}" if can_urls else ""
+    path = f", {plan.can.path} torque path" if plan.can.closed else ""
+    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{path}{bus}; into {folder}"

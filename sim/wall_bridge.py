@@ -103,7 +103,8 @@ class WallBridge:
         before = self._last[message.source]
         if before is None or message.sequence > before.sequence:
             self._last[message.source] = message
-            self._send_robot(now_ns, message.source, message.time_ns // self._period_ns)
+            if message.sequence >= now_ns // self._period_ns - 1:  # or else newer ones are on their way
+                self._send_robot(now_ns, message.source, message.sequence)
             latency_ns = now_ns - message.time_ns
             self.latencies.append(latency_ns)
             self.in_time += latency_ns < self._period_ns
@@ -119,7 +120,9 @@ class WallBridge:
 
     def pass_time(self, now_ns: int) -> None:
         """Does what is due: a new period, and telling robots of the one that ended."""
-        while now_ns >= self._cycle * self._period_ns:
+        if now_ns >= self._cycle * self._period_ns:
+            # After a standstill the periods that are over stay without frames; a burst of them would help nobody.
+            self._cycle = now_ns // self._period_ns
             for bus, frames in self._role.apply_events(now_ns):
                 for frame in frames:
                     self._put(now_ns, bus, frame)

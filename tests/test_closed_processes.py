@@ -75,12 +75,15 @@ class Listener:
         """When a robot's drive last reported torque"""
         self.heard_ns = [0] * ROBOTS
         """When a robot's drive last reported"""
+        self.commands = 0
+        """Torque frames of the first robot"""
 
     def listen(self, until_ns: int) -> None:
         """Listens until an instant of the monotonic clock."""
         while (left_ns := until_ns - time.monotonic_ns()) > 0:
             received = self._bus.recv(left_ns * 1e-9)
             now_ns = time.monotonic_ns()
+            self.commands += received is not None and received.can_id == BASE_ID
             if received is None or not FEEDBACK_ID <= received.can_id < FEEDBACK_ID + ROBOTS:
                 continue
             robot = received.can_id - FEEDBACK_ID
@@ -133,6 +136,19 @@ def test_who_is_frozen_lets_nobody_drive_on(wall_run: tuple[Popen[str], Listener
     for robot in hit:
         assert listener.moving_ns[robot] < frozen_ns + HALF_A_SECOND
         assert listener.heard_ns[robot] > frozen_ns + 3 * HALF_A_SECOND  # it still says that there is none
+
+
+def test_a_bridge_that_stood_still_makes_up_for_nothing(wall_run: tuple[Popen[str], Listener, Path]) -> None:
+    command, listener, _ = wall_run
+    bridge = pid_of(command.pid, "bridge")
+    os.kill(bridge, signal.SIGSTOP)
+    listener.listen(time.monotonic_ns() + 2 * HALF_A_SECOND)
+    stopped_ns, before = time.monotonic_ns(), listener.commands
+    os.kill(bridge, signal.SIGCONT)
+    listener.listen(stopped_ns + HALF_A_SECOND)
+    assert 10 < listener.commands - before < 75  # fifty periods; a hundred were missed
+    listener.listen(stopped_ns + 4 * HALF_A_SECOND)
+    assert min(listener.moving_ns) > stopped_ns + HALF_A_SECOND  # and the drives recovered
 
 
 @pytest.mark.parametrize("killed", ["g2/r5", "g3", "coordinator", "bridge", "drives"])

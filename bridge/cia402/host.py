@@ -33,13 +33,15 @@ class Master:
         if period_ns <= 0 or watchdog_ns <= 0:
             raise ValueError(f"period and watchdog must be positive, not {period_ns!r} and {watchdog_ns!r} ns")
         self._every_ns = heartbeat_ns(period_ns, watchdog_ns)
+        self._slack_ns = period_ns // 2
         self._next_ns: int | None = None
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns the host's heartbeat when it is due; to be called once per period."""
-        if self._next_ns is not None and time_ns < self._next_ns:
+        """Returns the host's heartbeat when it is due; to be called once per period, early or late by less than half of it."""
+        due_ns = time_ns if self._next_ns is None else self._next_ns
+        if time_ns < due_ns - self._slack_ns:
             return []
-        self._next_ns = time_ns + self._every_ns
+        self._next_ns = max(due_ns, time_ns - self._slack_ns) + self._every_ns  # after a standstill from now on
         return [heartbeat(HOST_NODE, Nmt.OPERATIONAL)]
 
     def sync(self) -> Frame:

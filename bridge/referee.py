@@ -63,7 +63,7 @@ class Referee:
         self.kinds: Counter[str] = Counter()
         self.kept: list[dict[str, Any]] = []
         """The first findings, ready for JSON"""
-        self.robots = [WheelCheck(plan, robot) for robot in plan.robots]
+        self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
         self._late = late
         self._silence_ns = plan.can.watchdog_ns
         self._lanes = [Lane(plan, bus) for bus in range(len(plan.can.buses))]

@@ -21,9 +21,9 @@ _WHEELS: Final = ("right", "left")
 
 
 class WheelCheck:
-    """One robot: its observer, and what its wheels were last asked for."""
+    """One robot: its observer, and what its wheels were last asked for; drives may be late by `late_ns`."""
 
-    def __init__(self, plan: Plan, robot: RobotPlan) -> None:
+    def __init__(self, plan: Plan, robot: RobotPlan, late_ns: int = 0) -> None:
         self.plan = robot
         self.name = robot.name
         self.envelope = robot.envelope
@@ -32,7 +32,7 @@ class WheelCheck:
         bits = {"native": drive.torque_scale, "cia402": max(1, round(1000 * motor.rated_torque)) * 1e-6, "odrive": 0.0}
         self._bit = bits[drive.protocol] * 1.000001
         slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
-        self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns)
+        self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns) + late_ns
         self._wheels = [Commands(self._effect_ns) for _ in _WHEELS]
         self._begin_ns: int | None = None
 

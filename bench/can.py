@@ -27,9 +27,9 @@ from bridge.protocols import drive_places, make_drive
 from echelon.load import effective_toml, load
 from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan import Plan
-from sim.commands import SCENARIOS
 from sim.engine import Engine
 from sim.supervisor import Supervisor
+from sim.usage import SCENARIOS
 
 CYCLES: Final = 500
 """Of nine frames each."""

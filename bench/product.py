@@ -8,11 +8,11 @@ from pathlib import Path
 
 from bridge.bus import resolve_url
 from echelon.load import effective_toml, load
-from sim.commands import SCENARIOS
 from sim.engine import Engine
 from sim.live import Display
 from sim.run import execute
 from sim.supervisor import Supervisor
+from sim.usage import SCENARIOS
 
 
 @dataclass(frozen=True, slots=True)

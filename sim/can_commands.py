@@ -20,8 +20,7 @@ from bridge.referee import Referee, judge_log, read_run_log
 from echelon.load import ScenarioError, parse
 from echelon.plan import Plan
 from sim.can_table import CanTable, finding_text
-from sim.commands import scenario_of
-from sim.usage import UsageError
+from sim.usage import UsageError, scenario_of
 
 TICK_S: Final = 0.1
 """Listening looks up so often though nothing comes"""

@@ -9,27 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from echelon.load import ScenarioError, load
-from echelon.plan import Plan
-from echelon.scenario import Scenario
-from sim.usage import UsageError
-
-SCENARIOS = Path(__file__).resolve().parent.parent / "deploy" / "scenarios"
-
-
-def scenario_of(arguments: argparse.Namespace) -> tuple[Scenario, Plan]:
-    """Loads the scenario that a command names: a file, or one of those shipped.  Raises UsageError."""
-    name = arguments.scenario
-    path = Path(name)
-    if not path.exists() and path.suffix == "" and "/" not in name:
-        shipped = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
-        if name not in shipped:
-            raise UsageError(f"{name}: no such file, and no shipped scenario; those are {', '.join(shipped)}")
-        path = SCENARIOS / f"{name}.toml"
-    try:
-        return load(path, getattr(arguments, "set", None) or ())
-    except ScenarioError as error:
-        raise UsageError(str(error)) from None
+from sim.usage import UsageError, scenario_of
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -66,20 +46,14 @@ def validate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def write_report(folders: list[Path], path: Path) -> None:
-    """Writes a report of runs.  Raises UsageError and OSError."""
-    from sim import report
-    from sim.run_folder import read_run
-
-    report.write_report([read_run(folder) for folder in folders], path)
-
-
 def report(arguments: argparse.Namespace) -> int:
     """`echelon report`"""
     folders = [Path(run) for run in arguments.runs]
     path = arguments.out or (folders[0] / "report.html" if len(folders) == 1 else Path("report.html"))
+    from sim.run_folder import report_on
+
     try:
-        write_report(folders, path)
+        report_on(folders, path)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     print(path)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from echelon.plan import Plan
-from sim.commands import scenario_of, write_report
-from sim.usage import UsageError
+from sim.usage import UsageError, scenario_of
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -60,7 +59,9 @@ def run(arguments: argparse.Namespace) -> int:
     failure = finished.failure
     if not arguments.no_report:
         try:
-            write_report([folder], folder / "report.html")
+            from sim.run_folder import report_on  # matplotlib, when it is needed
+
+            report_on([folder], folder / "report.html")
         except (UsageError, OSError) as error:  # of a run that broke off there may be nothing to report
             failure = failure or f"no report: {error}"
     if arguments.json:

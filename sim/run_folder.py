@@ -12,7 +12,7 @@ from bridge.plan_dbc import plan_dbc
 from echelon.load import ScenarioError, parse
 from echelon.plan import Plan
 from sim.recording import read_trace
-from sim.report import RunForReport
+from sim.report import RunForReport, write_report
 from sim.usage import UsageError
 
 FRAMES: Final = 18
@@ -31,6 +31,11 @@ def read_run(folder: Path) -> RunForReport:
     except (ScenarioError, ValueError) as error:
         raise UsageError(f"{folder}: {error}") from None
     return RunForReport(folder.name, trace, summary, toml, first_frames(folder / "can.log", plan))
+
+
+def report_on(folders: list[Path], path: Path) -> None:
+    """Writes a report of runs.  Raises UsageError and OSError."""
+    write_report([read_run(folder) for folder in folders], path)
 
 
 def first_frames(path: Path, plan: Plan, count: int = FRAMES) -> tuple[dict[str, object], ...]:

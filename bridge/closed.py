@@ -11,10 +11,9 @@ from bridge.bus_model import BusEventKind
 from bridge.canlog import CanLog
 from bridge.commander import Commander
 from bridge.fit import plan_fit
-from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, unpack
+from bridge.frame_message import BRIDGE_NODE, TimedFrame
 from bridge.on_bus import Rail, on_bus
 from bridge.plan_dbc import dbc_names, plan_dbc
-from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.role import Stage
 
@@ -42,24 +41,21 @@ class ClosedStation:
         # The log begins with the bringing up of the drives; run time 0 is `can.bring_up` later.
         self._names = [bus.name for bus in plan.can.buses]
         self._log = CanLog(folder / LOG, self._names[0], plan.can.bring_up_ns)
-        self._paired = paired
         self.frames = 0
         self.messages = 0
         self._robots: dict[str, Any] = {}
         self.stages: tuple[Stage, ...] = self.role.stages
         if self.buses and paired:
-            self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.note)
+            self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.log)
 
     @property
     def url(self) -> str:
         """Where the frames can be heard."""
         return ", ".join(self.urls) or "nowhere"
 
-    def note(self, message: Message) -> None:
-        """Logs the frames of a message of the bridge's; shows them on the bus if nobody else does."""
-        frames = [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
-        self.messages += 1
-        if self.buses and not self._paired:
+    def show(self, frames: Sequence[TimedFrame]) -> None:
+        """Puts frames on the buses where nobody else does, in one process, and into the log."""
+        if self.buses:
             self.rail.put(frames)
         self.log(frames)
 
@@ -81,10 +77,6 @@ class ClosedStation:
         for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
             self.buses[bus].send(can_id, data, time_ns, remote)
         self.log(frames)
-
-    def flush(self) -> None:
-        """Hands what is logged to the operating system."""
-        self._log.flush()
 
     def close(self) -> None:
         """Closes log and buses."""
@@ -126,6 +118,7 @@ class ClosedStation:
             "failed": sum(bus.counts.failed for bus in self.buses),
             "dropped": sum(bus.counts.dropped for bus in self.buses),
             "foreign": self.rail.foreign,
+            "refused": dict(self.role.refused),
             "log_lost": self._log.counts.lost,
             "log_error": str(self._log.error) if self._log.error else None,
             "stopped": sum(sum(row["stopped"].values()) for row in robots.values()),

@@ -23,10 +23,11 @@ from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
 from bridge.protocols import drive_places, make_host
 from bridge.schedule import Schedule
 from echelon.can_plan import EventPlan
-from echelon.messages import Channel, Heard, Message
+from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage
 
+_COMMANDED: Final = TORQUE_FIELDS.index("commanded")
 NOT_COMMANDED: Final = "no command"
 """Why a torque is zero besides the reasons of the envelope: the robot said it has none, or nothing (fresh) came from it."""
 
@@ -64,7 +65,7 @@ class Torques:
         # What a host sends first when drives take torque (again) is zero, whatever is wanted; limits count from there.
         gives, self._gave = self.host.enabled and self._gave, self.host.enabled
         tau_right = tau_left = saturated = 0.0
-        commanded = heard is not None and heard.values[2] == 1.0
+        commanded = heard is not None and heard.values[_COMMANDED] == 1.0
         if commanded and not gives:
             self.envelope.stop(time_ns)
         elif heard is not None and commanded:
@@ -130,8 +131,6 @@ class Commander:
         self._error_rates = [0.0] * len(self.buses)
         self.refused: Counter[str] = Counter()
         """What came as messages and cannot be"""
-        self.lost: Counter[int] = Counter()
-        """Frames of the bridge that its queue had no room for, by identifier"""
         deepest = max(node.depth for node in plan.nodes)
         heard = tuple(Input(station.index, Channel.FRAMES) for station in plan.stations[1:])
         torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
@@ -209,11 +208,8 @@ class Commander:
         return all(robot.host.torque_ns is not None and robot.host.torque_ns >= time_ns for robot in self.robots)
 
     def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
-        send = self.buses[bus].send
-        off = self.buses[bus].is_off(BRIDGE_NODE)
         for frame in frames:
-            if off or not send(time_ns, BRIDGE_NODE, frame):
-                self.lost[frame.can_id] += 1
+            self.buses[bus].send(time_ns, BRIDGE_NODE, frame)  # what finds no room is counted there
 
     def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Makes happen what the scenario has for this instant; returns the frames of an e-stop, bus by bus."""

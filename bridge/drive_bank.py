@@ -179,6 +179,10 @@ class DriveBank:
     def _drive_of(self, robot: int, wheel: int) -> PlacedDrive:
         return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
+    def result(self) -> dict[str, Any]:
+        """Returns what there is to say of the drives for a run's summary."""
+        return {"robots": self.summary(), "refused": dict(self.refused)}
+
     def summary(self) -> dict[str, Any]:
         """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""
         rows: dict[str, dict[str, Any]] = {

@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bridge.bus_load import worst_case_bits
-from bridge.protocols import dbc_messages, make_observer
+from bridge.cia402.codec import SYNC_ID
+from bridge.protocols import dbc_messages, make_observer, shared_cyclic
 from bridge.response_time import Stream, advice, fits, load, response_times
 from echelon.plan import Plan
-
-SYNC_ID, HOST_HEARTBEAT_ID = 0x080, 0x77F
-"""What every CANopen bus has once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +53,11 @@ def robot_streams(plan: Plan, robot: int) -> list[Stream]:
 def bus_fit(plan: Plan, bus: int) -> Fit:
     """Returns how the plan's frames fit one of its buses."""
     robots = {robot.name: robot_streams(plan, robot.index) for robot in plan.robots if robot.drive.bus == bus}
-    shared: list[Stream] = []
-    if any(robot.drive.protocol == "cia402" and robot.drive.bus == bus for robot in plan.robots):
-        period_ns = plan.robots[0].drive.period_ns
-        shared = [Stream(SYNC_ID, period_ns, worst_case_bits(0))]
-        if plan.can.closed:
-            shared.append(Stream(HOST_HEARTBEAT_ID, plan.can.watchdog_ns // 4, worst_case_bits(1)))
+    shared = [
+        Stream(can_id, period_ns, worst_case_bits(0 if can_id == SYNC_ID else 1))
+        for on, can_id, period_ns in shared_cyclic(plan)
+        if on == bus and plan.can.closed
+    ]
     everything = [*shared, *(stream for streams in robots.values() for stream in streams)]
     bitrate = plan.can.buses[bus].bitrate
     return Fit(

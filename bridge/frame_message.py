@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bridge.frame import Frame
-from echelon.messages import Values
+from echelon.messages import Message, Values
 
 BRIDGE_NODE: Final = 0
 """The bridge's number among the nodes of a bus; drives have those from 1 on."""
@@ -44,6 +44,11 @@ def pack(frames: Iterable[TimedFrame]) -> Values:
     for time_ns, bus, node, (can_id, data, remote) in frames:
         add_words(words, time_ns, bus, node, can_id, data, remote)
     return np.array(words, dtype="<u8").view(np.float64)
+
+
+def frames_of(message: Message) -> list[TimedFrame]:
+    """Returns the frames in a message, without what the bridge tells besides."""
+    return [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
 
 
 def unpack(values: Values) -> list[TimedFrame]:

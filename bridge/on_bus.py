@@ -16,7 +16,7 @@ from typing import Final
 
 from bridge.bus import Bus
 from bridge.frame import Frame
-from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, unpack
+from bridge.frame_message import BRIDGE_NODE, TimedFrame, frames_of
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 
@@ -70,29 +70,27 @@ class Rail:
 
 
 def on_bus(
-    stages: Sequence[Stage], rail: Rail, is_bridge: bool, said: Callable[[Message], None] = lambda message: None
+    stages: Sequence[Stage], rail: Rail, is_bridge: bool, said: Callable[[list[TimedFrame]], None] = lambda frames: None
 ) -> tuple[Stage, ...]:
-    """Returns a station's stages with their frames going over the buses; `said` sees the frames that the station says.
+    """Returns a station's stages with their frames going over the buses; `said` gets all frames of what it says.
 
     The bridge's messages hold all frames of a bus; those with its own node number are its own.
     """
 
-    def split(message: Message) -> tuple[list[TimedFrame], list[TimedFrame]]:
-        frames = [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
-        of_bridge = [timed for timed in frames if timed.node == BRIDGE_NODE]
-        of_drives = [timed for timed in frames if timed.node != BRIDGE_NODE]
-        return (of_bridge, of_drives) if is_bridge else (of_drives, of_bridge)
+    def own(timed: TimedFrame) -> bool:
+        return (timed.node == BRIDGE_NODE) is is_bridge
 
     def wrapped(stage: Stage) -> Stage:
         def run(time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
             for message in heard:
                 if message is not None and message.channel is Channel.FRAMES:
-                    rail.expect(split(message)[1])
+                    rail.expect([timed for timed in frames_of(message) if not own(timed)])
             messages = stage.run(time_ns, heard)
             for message in messages:
                 if message.channel is Channel.FRAMES:
-                    rail.put(split(message)[0])
-                    said(message)
+                    frames = frames_of(message)
+                    rail.put([timed for timed in frames if own(timed)])
+                    said(frames)
             return messages
 
         return replace(stage, run=run)

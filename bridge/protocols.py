@@ -4,6 +4,8 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final, NamedTuple
 
+from bridge.cia402.codec import HEARTBEAT_ID, HOST_NODE, SYNC_ID
+from bridge.cia402.configuration import heartbeat_ns
 from bridge.frame import Drive, Host
 from bridge.observe import Observer
 from echelon.can_plan import DrivePlan
@@ -53,6 +55,17 @@ def make_observer(robot: RobotPlan) -> Observer:
     """Returns what listens to a robot's frames."""
     observer: Observer = _part(robot.drive.protocol, "observe", "Observer")(robot.drive, robot.envelope, robot.index)
     return observer
+
+
+def shared_cyclic(plan: Plan) -> list[tuple[int, int, int]]:
+    """Returns what is cyclic on CANopen buses without being a robot's, SYNC and the host's heartbeat: bus, identifier,
+    period [ns]."""
+    found = []
+    for bus in sorted({robot.drive.bus for robot in plan.robots if robot.drive.protocol == "cia402"}):
+        period_ns = min(robot.drive.period_ns for robot in plan.robots if robot.drive.bus == bus)
+        found.append((bus, SYNC_ID, period_ns))
+        found.append((bus, HEARTBEAT_ID + HOST_NODE, heartbeat_ns(period_ns, plan.can.watchdog_ns)))
+    return found
 
 
 def torque_frames(robot: RobotPlan) -> Callable[[float, float], list[tuple[int, bytes]]]:

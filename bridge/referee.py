@@ -27,11 +27,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from bridge.canlog import read_log
-from bridge.cia402.codec import HEARTBEAT_ID, HOST_NODE, SYNC_ID
-from bridge.cia402.configuration import heartbeat_ns
 from bridge.due import Lane
 from bridge.frame import Frame
 from bridge.observe import Finding, Observer
+from bridge.protocols import shared_cyclic
 from bridge.wheel_check import WheelCheck
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
@@ -74,7 +73,7 @@ class Referee:
                 watch.robots += (robot,)
                 watch.asked_empty = plan.can.closed and robot.plan.drive.protocol == "odrive"
         if plan.can.closed:
-            for bus, can_id, period_ns in _shared(plan):
+            for bus, can_id, period_ns in shared_cyclic(plan):
                 self._lanes[bus].add(can_id, period_ns, tolerance_ns)
             for robot in self.robots:
                 if robot.plan.drive.protocol == "cia402":
@@ -203,14 +202,6 @@ class Referee:
                 }
             )
         return finding
-
-
-def _shared(plan: Plan) -> Iterator[tuple[int, int, int]]:
-    """Yields what is cyclic on CANopen buses without being a robot's: bus, identifier, period [ns]."""
-    for bus in sorted({robot.drive.bus for robot in plan.robots if robot.drive.protocol == "cia402"}):
-        period_ns = min(robot.drive.period_ns for robot in plan.robots if robot.drive.bus == bus)
-        yield bus, SYNC_ID, period_ns
-        yield bus, HEARTBEAT_ID + HOST_NODE, heartbeat_ns(period_ns, plan.can.watchdog_ns)
 
 
 def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+from bridge.frame_message import frames_of
 from echelon.load import effective_toml
 from echelon.messages import Channel
 from echelon.plan import Plan
@@ -150,7 +151,7 @@ def _in_process(
         if plan.stations:
             for message in gathered:
                 if message.channel is Channel.FRAMES and message.source == station.index:
-                    station.note(message)
+                    station.show(frames_of(message))
         elif station is not None:
             gathered.extend(station.put(gathered))  # robots speak in their order, instant by instant
         recording.add(order.push(gathered))
@@ -212,7 +213,7 @@ def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
 
         drives = engine.roles[engine.plan.stations[1].index]
         assert isinstance(drives, DriveBank)
-        result["drives"] = {"robots": drives.summary()}
+        result["drives"] = drives.result()
     return result
 
 

@@ -38,7 +38,7 @@ class DrivesStation:
 
     def result(self) -> dict[str, Any]:
         """Returns what the drives saw."""
-        return {"robots": self.role.summary(), "foreign": self.rail.foreign}
+        return self.role.result() | {"foreign": self.rail.foreign}
 
     def close(self) -> None:
         """Closes the buses."""

@@ -220,7 +220,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     control.send(("bus", bridge.station.url))
     start_ns = meet(spec, session, control)
     bridge.epoch_ns = epoch_ns_of(start_ns)
-    said_ns = now_ns = -1 << 62
+    said_ns = -1 << 62
 
     def now() -> int:
         return time.monotonic_ns() - start_ns
@@ -239,8 +239,8 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         if control.poll():
             control.recv()
             break
-    bridge.stop(now())
     bridge.frames(now())
+    bridge.stop(now())
     bridge.station.close()
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))

@@ -42,7 +42,7 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
         bus.close()
     cpu_s, resident = resources()
     failed = sum(bus.counts.failed + bus.counts.dropped for bus in buses)
-    control.send(("done", Result(spec.name, cpu_s, resident, extra={"robots": bank.summary(), "failed": failed})))
+    control.send(("done", Result(spec.name, cpu_s, resident, extra=bank.result() | {"failed": failed})))
     control.recv()
 
 

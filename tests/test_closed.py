@@ -314,7 +314,7 @@ def test_an_overloaded_bus_loses_frames_and_says_so() -> None:
     bridge, drives = stations(engine)
     bus = bridge.buses[0]
     assert bus.load > 0.98
-    assert bridge.lost.total() + sum(placed.lost for placed in drives.drives) > 100
+    assert sum(row.lost for row in bus.traffic.values()) + sum(placed.lost for placed in drives.drives) > 100
     for row in bus.traffic.values():
         assert row.sent == row.delivered + row.lost + row.pending
 
@@ -338,7 +338,7 @@ def test_disturbed_frames_are_sent_again_and_a_controller_that_is_off_comes_back
     assert 100 * MS < gap < 125 * MS  # can.restart, 128 times 11 idle bits, and the way to the next period
     # What waited meanwhile is lost and does not come late.
     assert all(bus.traffic[0x100 + robot].latency_max_ns < 2 * PERIOD for robot in range(9))
-    assert bridge.lost[0x100] > 8
+    assert bus.traffic[0x100].lost > 8
     assert heard.got[1900 * MS].any(axis=1).all()  # all were enabled again
 
 

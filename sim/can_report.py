@@ -16,7 +16,6 @@ SIMPLE: Final = (
     "timing",
     "torque_scale",
     "frames",
-    "fit",
     "sent",
     "failed",
     "dropped",
@@ -30,7 +29,9 @@ def can_section(can: dict[str, Any], frames: Sequence[Mapping[str, object]]) -> 
     if not can or not can.get("frames"):
         return paragraph("No bus in this run.")
     text = paragraph(" ".join(_sentences(can)))
-    text += table(["", ""], [[key.replace("_", " "), _plain(can[key])] for key in SIMPLE if key in can])
+    fit = can.get("fit") or []
+    text += "".join(paragraph(f"{line}.") for line in ([fit] if isinstance(fit, str) else fit))
+    text += table(["", ""], [[key.replace("_", " "), _plain(can[key])] for key in SIMPLE if key in can], numeric_from=2)
     if advice := can.get("advice"):
         text += paragraph("To make it fit: " + "; ".join(advice) + ".")
     if referee := can.get("referee"):
@@ -80,7 +81,8 @@ def _buses(buses: Any) -> str:
         if rows and any(row[1] for row in rows):
             head = ["identifier", "frames", "lost", "sent again", "mean latency [ms]", "largest [ms]", "bound [ms]"]
             load = f"{bus['name']}: {100 * bus['load']:.3g} % of {bus['bitrate'] / 1e3:g} kbit/s"
-            text += subheading(load) + table(head, rows)
+            bound = "The bound is for cyclic frames alone: what brings drives up, clears faults or is sent again comes on top."
+            text += subheading(load) + table(head, rows) + paragraph(bound)
     return text
 
 

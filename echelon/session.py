@@ -73,8 +73,13 @@ class Inbox:
         self._some.set()
         while self._hold and len(payloads) >= self._high_water:
             self._room.clear()
-            if len(payloads) >= self._high_water:
+            if self._hold and len(payloads) >= self._high_water:
                 self._room.wait()
+
+    def _let_go(self) -> None:
+        """Holds nobody any more: Zenoh's thread, which may stand in `_receive`, is needed for closing."""
+        self._hold = False
+        self._room.set()
 
 
 class Publisher:
@@ -144,6 +149,7 @@ class Session:
             os.environ["ZENOH_RUNTIME"] = runtime.replace("rx:(handover:app)", "rx:(worker_threads:1)")
         self._lockstep = lockstep
         self._session = _open(listen, connect, lockstep)
+        self._inboxes: list[Inbox] = []
         self._kept: list[object] = []  # what is declared lives as long as the session
 
     def subscribe(self, keys: str | Iterable[str], receive: Receive) -> None:
@@ -165,6 +171,7 @@ class Session:
         # Zenoh's thread needs the interpreter for every payload; its owner, busy, would let go of it only every 5 ms.
         sys.setswitchinterval(1e-4)
         inbox = Inbox(high_water, self._lockstep)
+        self._inboxes.append(inbox)
         self.subscribe(keys, inbox._receive)
         return inbox
 
@@ -187,6 +194,8 @@ class Session:
 
     def close(self) -> None:
         """Ends the connection after delivering what was put.  Not to be called from a handler."""
+        for inbox in self._inboxes:
+            inbox._let_go()
         self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -227,6 +228,7 @@ def _flood(endpoint: str, parent: Connection) -> None:
             parent.send(number)  # about to put
             publisher.put(number.to_bytes(4, "little") + bytes(40_000))
         parent.send(None)
+        parent.recv()  # an ended process would close the pipe on whoever still reads it
 
 
 def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> None:
@@ -249,6 +251,32 @@ def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> N
         assert 0 < len(payloads) <= 8 + 1
         numbers += [int.from_bytes(payload[:4], "little") for payload in payloads]
     assert numbers == list(range(1000))
+
+
+class _Room(threading.Event):
+    """Tells when somebody waits for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waited_for = threading.Event()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.waited_for.set()
+        return super().wait(timeout)
+
+
+def test_a_session_with_a_full_inbox_can_be_closed(stack: ExitStack) -> None:
+    (endpoint,) = loopback_endpoints(1)
+    session = Session(listen=[endpoint], connect=[], lockstep=True)
+    closing = threading.Thread(target=session.close, daemon=True)
+    inbox = session.inbox("run/state", 8)
+    room = inbox._room = _Room()
+    session.declare_token("run/@alive/receiver")
+    _, _flood_says = child(stack, _flood, endpoint)
+    assert room.waited_for.wait(TIMEOUT_S), "nothing held the sender back"
+    closing.start()
+    closing.join(TIMEOUT_S)
+    assert not closing.is_alive()
 
 
 def _relay(endpoint: str, parent: Connection) -> None:

@@ -55,8 +55,8 @@ def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
     )
 
 
-def session_members(session: int) -> list[int]:
-    """Returns the processes of a session that are alive, zombies not counted."""
+def _alive() -> list[tuple[int, int, int]]:
+    """Returns process, parent and session of all that are alive, zombies not counted."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -64,9 +64,28 @@ def session_members(session: int) -> list[int]:
                 fields = (entry / "stat").read_text().rpartition(")")[2].split()
             except OSError:
                 continue
-            if int(fields[3]) == session and fields[0] != "Z":
-                found.append(int(entry.name))
+            if fields[0] != "Z":
+                found.append((int(entry.name), int(fields[1]), int(fields[3])))
     return found
+
+
+def session_members(session: int) -> list[int]:
+    """Returns the processes of a session that are alive."""
+    return [pid for pid, _, of in _alive() if of == session]
+
+
+def descendants(ancestor: int) -> list[int]:
+    """Returns the processes that come from one, over any number of generations."""
+    alive, found = _alive(), [ancestor]
+    for one in found:
+        found += [pid for pid, parent, _ in alive if parent == one]
+    return found[1:]
+
+
+def pid_of(name: str, processes: list[int]) -> int:
+    """Returns the one of some processes that bears a name."""
+    (pid,) = [pid for pid in processes if Path(f"/proc/{pid}/comm").read_text().strip() == name]
+    return pid
 
 
 def until(condition: Any, timeout_s: float = 20.0) -> bool:

@@ -14,7 +14,7 @@ from bridge.canlog import read_log
 from bridge.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
 from sim.joining import ProcessSpec
 from sim.supervisor import Supervisor
-from tests.runs import echelon, kill_session, plan_of, session_members, start_echelon, summary_of, until
+from tests.runs import echelon, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, until
 
 SHORT = ("--set", "duration=0.5", "--set", "claims=[]", "--no-report", "--quiet")
 ROBOTS = 9
@@ -115,12 +115,6 @@ def wall_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Listener, Path]]:
             command.communicate()
 
 
-def pid_of(session: int, name: str) -> int:
-    """Returns the process of a run that bears a name."""
-    (pid,) = [pid for pid in session_members(session) if Path(f"/proc/{pid}/comm").read_text().strip() == name]
-    return pid
-
-
 HALF_A_SECOND = 500_000_000
 """Five times the watchdog: what a busy machine may need on top of it"""
 
@@ -130,7 +124,7 @@ def test_who_is_frozen_lets_nobody_drive_on(wall_run: tuple[Popen[str], Listener
     """Frozen and not killed: nobody sees it end, so watchdogs and ages of messages alone can tell."""
     command, listener, _ = wall_run
     frozen_ns = time.monotonic_ns()
-    os.kill(pid_of(command.pid, frozen), signal.SIGSTOP)
+    os.kill(pid_of(frozen, session_members(command.pid)), signal.SIGSTOP)
     listener.listen(frozen_ns + 4 * HALF_A_SECOND)
     hit = range(3) if frozen.startswith("g1") else range(ROBOTS)
     for robot in hit:
@@ -140,7 +134,7 @@ def test_who_is_frozen_lets_nobody_drive_on(wall_run: tuple[Popen[str], Listener
 
 def test_a_bridge_that_stood_still_makes_up_for_nothing(wall_run: tuple[Popen[str], Listener, Path]) -> None:
     command, listener, _ = wall_run
-    bridge = pid_of(command.pid, "bridge")
+    bridge = pid_of("bridge", session_members(command.pid))
     os.kill(bridge, signal.SIGSTOP)
     listener.listen(time.monotonic_ns() + 2 * HALF_A_SECOND)
     stopped_ns, before = time.monotonic_ns(), listener.commands
@@ -155,7 +149,7 @@ def test_a_bridge_that_stood_still_makes_up_for_nothing(wall_run: tuple[Popen[st
 def test_who_is_killed_ends_the_run_without_torque(wall_run: tuple[Popen[str], Listener, Path], killed: str) -> None:
     command, listener, folder = wall_run
     killed_ns = time.monotonic_ns()
-    os.kill(pid_of(command.pid, killed), signal.SIGKILL)
+    os.kill(pid_of(killed, session_members(command.pid)), signal.SIGKILL)
     listener.listen(killed_ns + 2 * HALF_A_SECOND)
     assert max(listener.moving_ns) < killed_ns + HALF_A_SECOND
     assert command.wait(30) == 3

@@ -10,7 +10,7 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
-from runs import kill_session, plan_of, session_members, start_echelon, summary_of, trace_of, until
+from runs import descendants, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, trace_of, until
 
 from echelon.plan import Plan
 from sim.joining import ProcessSpec
@@ -39,12 +39,6 @@ def long_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Path]]:
     finally:
         kill_session(command.pid)
         command.communicate()
-
-
-def pid_of(session: int, name: str) -> int:
-    """Returns the process of a run that bears a name."""
-    (pid,) = [pid for pid in session_members(session) if Path(f"/proc/{pid}/comm").read_text().strip() == name]
-    return pid
 
 
 def finished(command: Popen[str]) -> tuple[int, str, str]:
@@ -131,7 +125,7 @@ def test_wall_clock_gives_the_same_when_nothing_is_late(tmp_path: Path) -> None:
 
 def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:
     command, folder = long_run
-    os.kill(pid_of(command.pid, "g2/r5"), signal.SIGKILL)
+    os.kill(pid_of("g2/r5", session_members(command.pid)), signal.SIGKILL)
     code, _, err = finished(command)
     assert code == 3
     assert "lost robot g2/r5 (killed by SIGKILL)" in err
@@ -157,7 +151,7 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
 
     def watch(progress: Progress) -> None:
         if progress.time_ns and not stopped:
-            stopped.extend(pid_of(os.getsid(0), "g2/r5") for _ in range(1))
+            stopped.append(pid_of("g2/r5", descendants(os.getpid())))
             os.kill(stopped[0], signal.SIGSTOP)
         if progress.note and progress.note not in notes:
             notes.append(progress.note)
@@ -179,7 +173,7 @@ def test_a_process_that_stands_still_for_a_while_costs_only_time(
 
     def watch(progress: Progress) -> None:
         if progress.time_ns and not stopped:
-            stopped.append(pid_of(os.getsid(0), name))
+            stopped.append(pid_of(name, descendants(os.getpid())))
             os.kill(stopped[0], signal.SIGSTOP)
         if progress.note and progress.note not in notes:
             notes.append(progress.note)

@@ -79,7 +79,7 @@ class BusModel(Protocol):
     To answer frames at the instant they come: run to the earliest of `due_ns` and what else is due, and send then."""
 
     events: list[BusEvent]
-    """What happened so far, in order of time; may be emptied by who reads it."""
+    """What happened so far, in order of time."""
 
     @property
     def traffic(self) -> Mapping[int, Traffic]:

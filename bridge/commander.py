@@ -15,14 +15,15 @@ from typing import Any, Final
 import numpy as np
 
 from bridge.bus_load import worst_case_bits
+from bridge.bus_model import BusEventKind
 from bridge.bus_time import BusTime, IdealBus
 from bridge.cia402.host import Master
+from bridge.disturbances import Disturbances
 from bridge.envelope import Envelope
 from bridge.frame import Frame, Host
-from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
+from bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
 from bridge.protocols import drive_places, make_host
 from bridge.schedule import Schedule
-from echelon.can_plan import EventPlan
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage
@@ -125,10 +126,12 @@ class Commander:
             if any(robot.drive.protocol == "cia402" and robot.drive.bus == bus for robot in plan.robots)
         }
         self._places = drive_places(plan)
-        self._schedule = Schedule(event for event in plan.events if event.kind != "drive_fault")
+        self._estops = Schedule(event for event in plan.events if event.kind == "estop")
         self._stopped: set[int] = set()
         """Robots under an e-stop"""
-        self._error_rates = [0.0] * len(self.buses)
+        self._disturbances = Disturbances(plan, self.buses)
+        self._told = [0] * len(self.buses)
+        """How many events of each bus drives have been told of"""
         self.refused: Counter[str] = Counter()
         """What came as messages and cannot be"""
         deepest = max(node.depth for node in plan.nodes)
@@ -146,8 +149,9 @@ class Commander:
                 if at_ns != time_ns or bus >= len(self.buses):
                     self.refused["frame of no drive"] += 1
                     continue
-                self.buses[bus].send(at_ns, node, frame)
-                self.receive(at_ns, bus, frame)
+                model = self.buses[bus]
+                if model.send(at_ns, node, frame) and not (model.is_off(node) or model.is_off(BRIDGE_NODE)):
+                    self.receive(at_ns, bus, frame)
         return () if time_ns < 0 else (self.wheels(time_ns),)
 
     def receive(self, time_ns: int, bus: int, frame: Frame) -> None:
@@ -182,8 +186,8 @@ class Commander:
             for number, bus in enumerate(self.buses)
             for sent in bus.run(end_ns)
         ]
-        if len(self.buses) > 1:
-            carried.sort(key=lambda timed: timed.time_ns)
+        carried += self._marks()
+        carried.sort(key=lambda timed: timed.time_ns)
         sequence = (time_ns - self._first_ns) // self._period_ns
         return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(emptied + carried)),)
 
@@ -196,8 +200,19 @@ class Commander:
             for place in self._places:
                 if place.bus == number and bus.is_off(place.node):
                     bus.clear(place.node)
-                    emptied.append(TimedFrame(time_ns, NO_BUS, place.node, Frame(0)))
+                    emptied.append(TimedFrame(time_ns, NO_BUS, place.node, EMPTIED))
         return emptied
+
+    def _marks(self) -> list[TimedFrame]:
+        """Returns which drives' controllers left their bus or came back, since this was last asked for."""
+        marks = []
+        for number, bus in enumerate(self.buses):
+            for time_ns, node, kind, _ in bus.events[self._told[number] :]:
+                mark = {BusEventKind.OFF: OFF, BusEventKind.RECOVERED: BACK}.get(kind)
+                if mark is not None and node != BRIDGE_NODE:
+                    marks.append(TimedFrame(time_ns, NO_BUS, node, mark))
+            self._told[number] = len(bus.events)
+        return marks
 
     def bus_frames(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Returns, bus by bus, what is sent once per period whatever robots there are; on a wall clock, at its start."""
@@ -214,32 +229,15 @@ class Commander:
     def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Makes happen what the scenario has for this instant; returns the frames of an e-stop, bus by bus."""
         frames = []
-        active, begun = self._schedule.at(time_ns)
-        stopped = {robot for event in active if event.kind == "estop" for robot in event.robots}
+        stopped = {robot for event in self._estops.at(time_ns)[0] for robot in event.robots}
         for robot in sorted(stopped - self._stopped):
             torques = self.robots[robot]
             frames.append((torques.robot.drive.bus, torques.host.stop(time_ns)))
         for robot in self._stopped - stopped:
             self.robots[robot].host.start()
         self._stopped = stopped
-        for bus, model in enumerate(self.buses):
-            rate = max(
-                (event.rate for event in active if event.kind == "error_frames" and bus in event.buses), default=0.0
-            )
-            if rate != self._error_rates[bus]:
-                self._error_rates[bus] = rate
-                model.set_error_rate(rate)
-        for event in begun:
-            if event.kind == "bus_off":
-                for bus, node in self._nodes_of(event):
-                    self.buses[bus].bus_off(node)
+        self._disturbances.apply(time_ns)
         return frames
-
-    def _nodes_of(self, event: EventPlan) -> list[tuple[int, int]]:
-        """Returns bus and node of the controllers that an event is about: the bridge's, or those of robots' drives."""
-        if not event.robots:
-            return [(bus, BRIDGE_NODE) for bus in event.buses]
-        return [(place.bus, place.node) for place in self._places if place.robot in event.robots]
 
     def summary(self) -> dict[str, Any]:
         """Returns what the bridge saw of every robot."""

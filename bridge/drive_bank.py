@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from bridge.frame import Drive, Frame
-from bridge.frame_message import BRIDGE_NODE, NO_BUS, TimedFrame, pack, unpack
+from bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
 from bridge.motor import Fault
 from bridge.protocols import DrivePlace, drive_places, make_drive
 from bridge.schedule import Schedule
@@ -35,11 +35,19 @@ class PlacedDrive:
         """Frames that it sent and that the bus did not carry yet"""
         self.lost = 0
         """Frames that its queue had no room for"""
+        self.is_off = False
+        """Its controller is off the bus, and hears nothing"""
 
     def take(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus; answers are sent with the next report."""
         self.outbox += self.drive.advance(time_ns)
         self.outbox += self.drive.receive(time_ns, frame)
+
+    def take_mark(self, mark: Frame) -> None:
+        """Takes what the bridge tells of the drive's controller."""
+        self.is_off = mark != BACK
+        if mark == EMPTIED:
+            self.waiting = 0
 
 
 class DriveBank:
@@ -105,13 +113,20 @@ class DriveBank:
         for timed in unpack(frames.values) if frames is not None and frames.time_ns == time_ns else ():
             if not (time_ns <= timed.time_ns <= time_ns + self._period_ns and timed.node <= len(self.drives)):
                 self.refused["frame of no bus"] += 1
-            elif timed.node != BRIDGE_NODE:
-                placed = self.drives[timed.node - 1]
-                placed.waiting = 0 if timed.bus == NO_BUS else placed.waiting - 1
-            elif timed.bus < len(self._listeners):
-                for placed in self._listeners[timed.bus].get(timed.frame.can_id, ()):
-                    placed.take(timed.time_ns, timed.frame)
+            elif timed.node == BRIDGE_NODE:
+                if timed.bus < len(self._listeners):
+                    self._deliver(timed.time_ns, timed.bus, timed.frame)
+            elif timed.bus == NO_BUS:
+                self.drives[timed.node - 1].take_mark(timed.frame)
+            else:
+                self.drives[timed.node - 1].waiting -= 1
         return ()
+
+    def _deliver(self, time_ns: int, bus: int, frame: Frame) -> None:
+        """Lets all drives have a frame that listen to it, and whose controllers are on the bus."""
+        for placed in self._listeners[bus].get(frame.can_id, ()):
+            if not placed.is_off:
+                placed.take(time_ns, frame)
 
     # On a wall clock, frame by frame:
 
@@ -138,8 +153,7 @@ class DriveBank:
 
     def receive(self, time_ns: int, bus: int, frame: Frame) -> list[TimedFrame]:
         """Takes a frame from a bus; returns what the drives answer."""
-        for placed in self._listeners[bus].get(frame.can_id, ()):
-            placed.take(time_ns, frame)
+        self._deliver(time_ns, bus, frame)
         return self._emptied(time_ns)
 
     def pass_time(self, time_ns: int) -> list[TimedFrame]:

@@ -15,7 +15,13 @@ from echelon.messages import Message, Values
 BRIDGE_NODE: Final = 0
 """The bridge's number among the nodes of a bus; drives have those from 1 on."""
 NO_BUS: Final = 255
-"""Stands for the bus in what the bridge tells drives besides frames: that a node is off its bus, and its queue empty."""
+"""Stands for the bus in what the bridge tells drives besides frames: `OFF`, `EMPTIED` or `BACK` of a node."""
+OFF: Final = Frame(0)
+"""The node's controller is off its bus from now on: it hears nothing."""
+EMPTIED: Final = Frame(1)
+"""It is still off, and what waited in its queue is lost."""
+BACK: Final = Frame(2)
+"""It is on its bus again."""
 
 
 class TimedFrame(NamedTuple):

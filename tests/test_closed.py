@@ -371,6 +371,28 @@ def test_a_drive_that_is_off_the_bus_comes_back_with_news_only() -> None:
     assert bridge.robots[0].host.enabled
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_drive_that_is_off_the_bus_hears_nothing_and_is_not_heard(protocol: str) -> None:
+    """It takes the torque away by itself after the watchdog's time; and the bridge knows nothing of it until it is back."""
+    event = 'events=[{kind="bus_off", at=0.505, robot="g1/r1"}]'
+    bitrate = "can.bitrate=1000000"  # it goes off at the next torque period: 0.51 s
+    heard = Heard()
+    engine = Engine(closed(event, "can.restart=0.3", bitrate, f"robot.drive.protocol={protocol}", duration=0.9), heard)
+    bridge, drives = stations(engine)
+    mine = [motor for placed in drives.drives if placed.place.robot == 0 for motor in placed.drive.motors]
+    torques = {time_ns: max(abs(motor.torque) for motor in mine) for time_ns in engine.instants()}
+    assert all(torques[at * MS] > 0 for at in range(450, 600, 10))  # goes on with what it heard last
+    assert all(torques[at * MS] == 0 for at in range(630, 810, 10))
+    assert all(robot.host.enabled for robot in bridge.robots[1:])
+    from_drive = [
+        timed.time_ns for source, timed in heard.frames if timed.node == 1 and timed.bus == 0 and source == 13
+    ]
+    assert not [time_ns for time_ns in from_drive if 512 * MS < time_ns < 810 * MS]
+    assert [time_ns for time_ns in from_drive if time_ns > 815 * MS]
+    silent = [heard.got[at * MS][0] for at in range(620, 810, 10)]
+    assert not np.any(silent)
+
+
 def test_one_seed_one_run() -> None:
     def outcome(*overrides: str) -> tuple[str, bytes]:
         plan = closed(*overrides)

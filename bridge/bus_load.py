@@ -168,13 +168,3 @@ def bus_load(frames_per_second: float, bitrate: float, bits_per_frame: float = w
     if not bitrate > 0:
         raise ValueError(f"bit rate must be positive, not {bitrate!r}")
     return frames_per_second * bits_per_frame / bitrate
-
-
-def explain(robots: int, rate: float, bitrate: float, bits_per_frame: float = worst_case_bits(8)) -> str:
-    """One line that says whether the frames of `robots` at `rate` [Hz] each fit a bus of `bitrate` [bit/s], and why."""
-    load = bus_load(robots * rate, bitrate, bits_per_frame)
-    verdict = "fits" if load <= 1 else "does not fit"
-    speed = f"{bitrate / 1e6:g} Mbit/s" if bitrate >= 1e6 else f"{bitrate / 1e3:g} kbit/s"
-    noun = "robot" if robots == 1 else "robots"
-    percent = f"{100 * load:.3g} %"
-    return f"{verdict} one {speed} bus: {robots} {noun} x {rate:g} Hz x {bits_per_frame:.0f} bit = {percent}"

@@ -1,6 +1,6 @@
 """What a simulated CAN bus is to those who run it: frames and times in, frames with the instants they come at out.
 
-`bridge.bus_time` has the buses.  Pure; instants are integer nanoseconds.
+`bridge.bus_time` and `bridge.ideal_bus` have the buses.  Pure; instants are integer nanoseconds.
 """
 
 from collections.abc import Mapping
@@ -102,6 +102,12 @@ class BusModel(Protocol):
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
         """Puts a frame into a node's queue; False: the queue is full, the frame is lost.
+
+        Raises ValueError for a time before the last call's, and for a frame that is none."""
+
+    def hear(self, time_ns: int, frame: Frame) -> None:
+        """Takes note of a frame of a node that is not in this model, which ended by `time_ns`: the bus was taken, or will be
+        taken before frames of lower priority.
 
         Raises ValueError for a time before the last call's, and for a frame that is none."""
 

@@ -16,6 +16,9 @@ waits 8 bits longer after a frame of its own; over 255 (errors in sending) it is
 
 A node is any number; it counts errors from its first frame on.  Two nodes should not send the same identifier: if they do,
 what was sent first goes first.
+
+Frames of others, whose queues this model does not have, take the bus when it was free just before they were over; those
+that were sent meanwhile wait like all others, and take it then: so several models that hear each other share one bus.
 """
 
 import hashlib
@@ -44,6 +47,7 @@ _RECESSIVE, _RECESSIVE_RUNS = 11, 128
 _BLOCK = 512  # attempts that are drawn at a time; each takes one count of the Philox counter, which is four words
 _EVER = -(2**62)
 _NEVER = 2**62
+_OTHERS = -1  # stands for the node of what was heard
 
 
 class _Waiting(NamedTuple):
@@ -110,6 +114,7 @@ class BusTime(BusModel):
         self._began_ns: int | None = None
         self._now_ns = _EVER  # everything earlier is decided
         self._order = self._busy_ns = 0
+        self._others = 0  # frames of others that still have to take their time
         digest = hashlib.blake2b(f"{seed}|bus {bus_number}".encode(), digest_size=16).digest()
         self._key = int.from_bytes(digest, "little")
         self._attempts = 0
@@ -160,6 +165,21 @@ class BusTime(BusModel):
         self._order += 1
         heappush(self._pending, _Waiting(frame.can_id * 2 + frame.remote, self._order, time_ns, node, frame, bits))
         return True
+
+    def hear(self, time_ns: int, frame: Frame) -> None:
+        bits = frame_bits(frame.can_id, frame.data, frame.remote)
+        self._advance(time_ns)
+        began_ns = time_ns - self._span(bits - _INTERFRAME)
+        if self._free_ns <= began_ns:
+            self._note_start(began_ns)
+            self._free_ns = began_ns + self._span(bits)
+            self._busy_ns += self._free_ns - began_ns
+            self._count(time_ns, _OTHERS, destroyed=False)
+        elif self._others < self.capacity:
+            self._others += 1
+            self._order += 1
+            waiting = _Waiting(frame.can_id * 2 + frame.remote, self._order, time_ns, _OTHERS, frame, bits)
+            heappush(self._pending, waiting)
 
     def run(self, until_ns: int) -> list[Delivered]:
         self._advance(until_ns)
@@ -233,11 +253,8 @@ class BusTime(BusModel):
 
     def _begin(self, start_ns: int) -> None:
         current = self._pop(start_ns)
-        for off in self._off.values():
-            idle_ns = max(0, start_ns - self._recessive_from(off))
-            off.runs -= idle_ns * self.bitrate // (_RECESSIVE * 1_000_000_000)
-        self._suspended.clear()
-        hit = self._draw(current.bits) if self._rate else None
+        self._note_start(start_ns)
+        hit = self._draw(current.bits) if self._rate and current.node != _OTHERS else None
         if hit is None:
             on_bus, end = current.bits, current.bits - _INTERFRAME
         else:
@@ -248,6 +265,13 @@ class BusTime(BusModel):
         self._end_ns = start_ns + self._span(end)
         self._free_ns = start_ns + self._span(on_bus)
         self._busy_ns += self._free_ns - start_ns
+
+    def _note_start(self, start_ns: int) -> None:
+        """A frame starts: nodes that are off saw the bus idle until now, and nobody is suspended any more."""
+        self._suspended.clear()
+        for off in self._off.values():
+            idle_ns = max(0, start_ns - self._recessive_from(off))
+            off.runs -= idle_ns * self.bitrate // (_RECESSIVE * 1_000_000_000)
 
     def _pop(self, start_ns: int) -> _Waiting:
         """Takes the first in the order of priority of those whose node may start."""
@@ -277,7 +301,9 @@ class BusTime(BusModel):
     def _finish(self, current: _Waiting) -> None:
         end_ns, node, can_id = self._end_ns, current.node, current.frame.can_id
         self._current = None
-        if self._destroyed:
+        if node == _OTHERS:
+            self._others -= 1
+        elif self._destroyed:
             self._traffic[can_id].retransmitted += 1
             self.events.append(BusEvent(end_ns, node, BusEventKind.ERROR, can_id))
             heappush(self._pending, current)
@@ -285,19 +311,19 @@ class BusTime(BusModel):
             self._traffic[can_id].deliver(end_ns - current.queued_ns)
             self._nodes[node].held -= 1
             self._delivered.append(Delivered(current.queued_ns, end_ns, node, current.frame))
-        self._count(end_ns, node)
-        if self._nodes[node].passive:
+        self._count(end_ns, node, self._destroyed)
+        if node != _OTHERS and self._nodes[node].passive:
             self._suspended[node] = self._free_ns + self._span(_SUSPEND)
 
-    def _count(self, time_ns: int, sender: int) -> None:
+    def _count(self, time_ns: int, sender: int, destroyed: bool) -> None:
         """Error counters after an attempt."""
-        for node in sorted(self._nodes if self._destroyed else self._marked):
+        for node in sorted(self._nodes if destroyed else self._marked):
             if node in self._off:
                 continue
             state = self._nodes[node]
             if node == sender:
-                state.tec = state.tec + 8 if self._destroyed else max(0, state.tec - 1)
-            elif self._destroyed:
+                state.tec = state.tec + 8 if destroyed else max(0, state.tec - 1)
+            elif destroyed:
                 state.rec = min(PASSIVE_OVER + 1, state.rec + 1)
             else:
                 state.rec = RECOVERED_REC if state.rec > PASSIVE_OVER else max(0, state.rec - 1)
@@ -327,65 +353,3 @@ class BusTime(BusModel):
                 self._nodes[node] = _Node(self._nodes[node].held)
                 self._marked.discard(node)
                 self.events.append(BusEvent(time_ns, node, BusEventKind.RECOVERED))
-
-
-class IdealBus(BusModel):
-    """A bus that delivers every frame at the instant it is sent, in the order of sending, and loses none."""
-
-    def __init__(self) -> None:
-        self.events: list[BusEvent] = []
-        self._traffic: defaultdict[int, Traffic] = defaultdict(Traffic)
-        self._now_ns = _EVER
-        self._delivered: list[Delivered] = []
-
-    @property
-    def traffic(self) -> Mapping[int, Traffic]:
-        return self._traffic
-
-    @property
-    def due_ns(self) -> int | None:
-        return self._delivered[0].end_ns if self._delivered else None
-
-    @property
-    def busy_ns(self) -> int:
-        return 0
-
-    @property
-    def load(self) -> float:
-        return 0.0
-
-    def duration_ns(self, frame: Frame) -> int:
-        frame_bits(frame.can_id, frame.data, frame.remote)
-        return 0
-
-    def send(self, time_ns: int, node: int, frame: Frame) -> bool:
-        frame_bits(frame.can_id, frame.data, frame.remote)
-        self._advance(time_ns)
-        self._traffic[frame.can_id].sent += 1
-        self._delivered.append(Delivered(time_ns, time_ns, node, frame))
-        return True
-
-    def run(self, until_ns: int) -> list[Delivered]:
-        self._advance(until_ns)
-        delivered, self._delivered = self._delivered, []
-        for _, _, _, frame in delivered:
-            self._traffic[frame.can_id].deliver(0)
-        return delivered
-
-    def set_error_rate(self, rate: float) -> None:
-        if rate:
-            raise ValueError(f"an ideal bus has no errors: its error rate must be 0, not {rate!r}")
-
-    def is_off(self, node: int) -> bool:
-        return False
-
-    def clear(self, node: int) -> int:
-        return 0
-
-    def bus_off(self, node: int) -> None:
-        raise ValueError(f"an ideal bus has no errors: node {node!r} cannot be off")
-
-    def _advance(self, time_ns: int) -> None:
-        if time_ns < self._now_ns:
-            raise ValueError(f"time must not be before {self._now_ns} ns, not {time_ns!r}")
-        self._now_ns = time_ns

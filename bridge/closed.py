@@ -2,12 +2,12 @@
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from bridge.bus import Bus, listen_command, open_bus
-from bridge.bus_model import BusEventKind
+from bridge.buses import bus_row
 from bridge.canlog import CanLog
 from bridge.commander import Commander
 from bridge.fit import plan_fit
@@ -101,7 +101,9 @@ class ClosedStation:
         """Returns the counts of bridge, buses and log for the summary; robots as they were before `stop_wheels`."""
         robots = self._robots or self.role.summary()
         fit = plan_fit(self.plan)
-        buses = [self._bus_row(number, fit[number].responses_ns) for number in range(len(fit))]
+        buses = [
+            bus_row(self.plan, number, self.role.buses[number], bus.responses_ns) for number, bus in enumerate(fit)
+        ]
         return {
             "path": "closed",
             "timing": self.plan.can.timing,
@@ -123,32 +125,4 @@ class ClosedStation:
             "log_error": str(self._log.error) if self._log.error else None,
             "stopped": sum(sum(row["stopped"].values()) for row in robots.values()),
             "robots": robots,
-        }
-
-    def _bus_row(self, number: int, bounds_ns: Mapping[int, int | None]) -> dict[str, Any]:
-        """Returns what became of the frames on one bus; latencies [s] are from the queue to the end of the frame, and
-        their bounds those of the cyclic frames without errors."""
-        model, plan = self.role.buses[number], self.plan.can.buses[number]
-        traffic = dict(sorted(model.traffic.items()))
-        events = [event for event in model.events if event.kind is not BusEventKind.ERROR]
-        return {
-            "name": plan.name,
-            "bitrate": plan.bitrate,
-            "load": model.load,
-            "lost": sum(row.lost for row in traffic.values()),
-            "destroyed": sum(row.retransmitted for row in traffic.values()),
-            "events": [
-                {"time": event.time_ns / 1e9, "node": event.node, "event": event.kind.value} for event in events[:1000]
-            ],
-            "identifiers": {
-                f"{can_id:03X}": {
-                    "frames": row.delivered,
-                    "lost": row.lost,
-                    "destroyed": row.retransmitted,
-                    "latency_mean": row.latency_mean_ns / 1e9,
-                    "latency_max": row.latency_max_ns / 1e9,
-                    "latency_bound": None if (bound := bounds_ns.get(can_id)) is None else bound / 1e9,
-                }
-                for can_id, row in traffic.items()
-            },
         }

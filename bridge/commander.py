@@ -16,12 +16,14 @@ import numpy as np
 
 from bridge.bus_load import worst_case_bits
 from bridge.bus_model import BusEventKind
-from bridge.bus_time import BusTime, IdealBus
+from bridge.bus_time import BusTime
+from bridge.buses import make_buses
 from bridge.cia402.host import Master
 from bridge.disturbances import Disturbances
 from bridge.envelope import Envelope
 from bridge.frame import Frame, Host
 from bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
+from bridge.ideal_bus import IdealBus
 from bridge.protocols import drive_places, make_host
 from bridge.schedule import Schedule
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
@@ -31,14 +33,6 @@ from echelon.role import Input, Stage
 _COMMANDED: Final = TORQUE_FIELDS.index("commanded")
 NOT_COMMANDED: Final = "no command"
 """Why a torque is zero besides the reasons of the envelope: the robot said it has none, or nothing (fresh) came from it."""
-
-
-def make_bus(plan: Plan, number: int) -> BusTime | IdealBus:
-    """Returns the model of one of the plan's buses."""
-    can = plan.can
-    if can.timing == "ideal":
-        return IdealBus()
-    return BusTime(can.buses[number].bitrate, plan.seed, number, capacity=can.queue, restart_ns=can.restart_ns)
 
 
 def _fresh(message: Heard, time_ns: int) -> list[TimedFrame]:
@@ -104,9 +98,11 @@ class Torques:
 
 
 class Commander:
-    """The bridge's role in a plan with a closed torque path."""
+    """The bridge's role in a plan with a closed torque path.
 
-    def __init__(self, plan: Plan) -> None:
+    Its models of the buses have the drives' controllers in them too, unless `alone`."""
+
+    def __init__(self, plan: Plan, *, alone: bool = False) -> None:
         bridge = plan.stations[0]
         self.index = bridge.index
         self._first_ns = bridge.first_ns
@@ -114,7 +110,7 @@ class Commander:
         self.next_ns = bridge.first_ns
         """End of the last period that frames were made for"""
         self.robots = [Torques(robot) for robot in plan.robots]
-        self.buses: list[BusTime | IdealBus] = [make_bus(plan, number) for number in range(len(plan.can.buses))]
+        self.buses: list[BusTime | IdealBus] = make_buses(plan)
         self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
         for robot in self.robots:
             listeners = self._listeners[robot.robot.drive.bus]
@@ -129,7 +125,7 @@ class Commander:
         self._estops = Schedule(event for event in plan.events if event.kind == "estop")
         self._stopped: set[int] = set()
         """Robots under an e-stop"""
-        self._disturbances = Disturbances(plan, self.buses)
+        self._disturbances = Disturbances(plan, self.buses, drives=not alone)
         self._told = [0] * len(self.buses)
         """How many events of each bus drives have been told of"""
         self.refused: Counter[str] = Counter()

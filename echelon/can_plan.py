@@ -99,6 +99,8 @@ class CanPlan:
     torque_scale: float
     path: str
     timing: str
+    paced: bool
+    """On a wall clock, too, frames take as long as `timing` says; otherwise the bus takes its own time"""
     virtual_drives: bool
     watchdog_ns: int
     bring_up_ns: int

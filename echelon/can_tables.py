@@ -104,8 +104,10 @@ class Can(Table):
     path: Literal["mirror", "closed"] = "mirror"
     """`mirror`: the plant takes the computed torque, the bus shows it.  `closed`: the plant takes what the drives report,
     which is what they decoded from the frames"""
-    timing: Literal["bits", "ideal"] = "bits"
-    """How long frames take in virtual time on the closed path: as on a real bus, or no time at all"""
+    timing: Literal["bits", "ideal"] | None = None
+    """How long frames take on the closed path: as on a real bus (`bits`), or no time at all (`ideal`).  In virtual time `bits`
+    unless given; on a wall clock a bus takes its own time unless `bits` is given, which makes a virtual one as slow as a
+    real one"""
     virtual_drives: Flag = True
     """On the closed path: False leaves the bus to drives that are there already (wall clock only)"""
     watchdog: Seconds = 0.1

@@ -47,6 +47,10 @@ def make_can(can: Can, cycle_ns: int) -> CanPlan:
     ]
     if not can.virtual_drives and can.path != "closed":
         raise PlanError("can.virtual_drives = false: needs can.path = 'closed'")
+    if not can.virtual_drives and can.timing is not None:
+        raise PlanError(
+            f"can.timing = {can.timing!r}: not with can.virtual_drives = false; real buses take their own time"
+        )
     if can.path == "closed" and can.watchdog * 1e9 < 2 * cycle_ns:
         raise PlanError(f"can.watchdog = {can.watchdog}: must be at least two torque periods, {2 * cycle_ns / 1e9} s")
     urls = [bus.url for bus in buses if bus.url not in ("auto", "virtual")]
@@ -57,7 +61,8 @@ def make_can(can: Can, cycle_ns: int) -> CanPlan:
         buses=tuple(buses),
         torque_scale=can.torque_scale,
         path=can.path,
-        timing=can.timing,
+        timing=can.timing or "bits",
+        paced=can.timing == "bits",
         virtual_drives=can.virtual_drives,
         watchdog_ns=round(can.watchdog * 1e9),
         bring_up_ns=ceil(round(can.bring_up * 1e9) / cycle_ns) * cycle_ns,

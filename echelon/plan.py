@@ -6,7 +6,7 @@ Members are numbered: robots first, in the order of the tree, then nodes, childr
 Blocks of the transformed state (theory.md section 2) stand in the order of their nodes, then the centroid.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -220,3 +220,8 @@ class Plan:
     def block_of(self, node: int) -> BlockPlan:
         """The shape block of a node."""
         return next(block for block in self.blocks if block.node == node)
+
+
+def on_wall_clock(plan: Plan) -> Plan:
+    """Returns the plan as those have it who are on a bus on a wall clock: the bus takes its own time unless it is paced."""
+    return plan if plan.can.paced else replace(plan, can=replace(plan.can, timing="ideal"))

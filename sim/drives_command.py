@@ -14,7 +14,7 @@ from bridge.bus import Bus, listen_command, open_bus
 from bridge.drive_bank import DriveBank
 from echelon.drives import identifiers
 from echelon.plan import Plan, RobotPlan
-from sim.wall_drives import serve
+from sim.wall_drives import WallDrives
 
 LINE_S: Final = 1.0
 """Between two lines."""
@@ -50,7 +50,7 @@ def run_drives(plan: Plan, urls: Sequence[str], seconds: float | None, say: Call
     The plan has a closed torque path with virtual drives.  Raises ValueError or OSError if a bus cannot be had."""
     with ExitStack() as stack:
         buses = [stack.enter_context(open_bus(url)) for url in urls]
-        bank = DriveBank(plan)
+        drives = WallDrives(plan, buses)
         for line in describe(plan, [bus.url for bus in buses]):
             say(line)
         start_ns = time.monotonic_ns()
@@ -58,14 +58,14 @@ def run_drives(plan: Plan, urls: Sequence[str], seconds: float | None, say: Call
         said_s = now_s = 0.0
         try:
             while now_s < end_s:
-                serve(bank, buses, start_ns)
+                drives.serve(start_ns)
                 now_s = (time.monotonic_ns() - start_ns) / 1e9
                 if now_s >= said_s + LINE_S:
                     said_s = now_s
-                    say(line_of(plan, bank, buses, now_s))
+                    say(line_of(plan, drives.bank, buses, now_s))
         except KeyboardInterrupt:
             say("")
-        say(line_of(plan, bank, buses, now_s))
+        say(line_of(plan, drives.bank, buses, now_s))
 
 
 def line_of(plan: Plan, bank: DriveBank, buses: Sequence[Bus], now_s: float) -> str:

@@ -25,8 +25,12 @@ def run(arguments: argparse.Namespace) -> int:
     can_urls = bus_urls(plan, arguments.can, arguments.engine == "inprocess")
     if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
         raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
-    if arguments.clock == "wall" and (kinds := {event.kind for event in plan.events} & {"error_frames", "bus_off"}):
-        raise UsageError(f"events of kind {min(kinds)!r}: what a real bus does nobody can order; needs --clock virtual")
+    kinds = {event.kind for event in plan.events} & {"error_frames", "bus_off"}
+    if arguments.clock == "wall" and kinds and not plan.can.paced:
+        raise UsageError(
+            f"events of kind {min(kinds)!r}: with --clock wall the bus takes its own time, and errors, as they come; "
+            "can.timing = 'bits' makes a virtual one as slow as a real one, with errors on schedule"
+        )
     if plan.can.closed and arguments.engine == "processes" and any(url.startswith("virtual") for url in can_urls):
         raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
     if arguments.clock == "virtual" and not plan.can.virtual_drives:

@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final
 
+from bridge.buses import merge_rows
 from echelon.link import LinkCounts
 from echelon.plan import Plan
 from sim.children import FINISHING, Child, list_specs, start
@@ -345,6 +346,9 @@ class Supervisor:
             if child.result is not None and child.result.extra
         }
         recorded = extra.get("recorder", {})
+        known = extra.get("drives", {}).pop("buses", [])
+        if known and "bridge" in extra:
+            merge_rows(extra["bridge"]["buses"], known)
         return Outcome(
             trace=recorded.get("trace") or TraceBuilder(self.plan).build(),
             links=[counts for result in results for counts in result.links],

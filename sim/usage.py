@@ -18,7 +18,7 @@ def scenario_of(arguments: argparse.Namespace) -> tuple[Scenario, Plan]:
     """Loads the scenario that a command names: a file, or one of those shipped.  Raises UsageError."""
     name = arguments.scenario
     path = Path(name)
-    if not path.exists() and path.suffix == "" and "/" not in name:
+    if not path.is_file() and path.suffix == "" and "/" not in name:
         shipped = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
         if name not in shipped:
             raise UsageError(f"{name}: no such file, and no shipped scenario; those are {', '.join(shipped)}")

@@ -6,6 +6,7 @@ a robot that says nothing in a period has its last torque sent again, until the 
 
 import time
 from array import array
+from collections import deque
 from heapq import heappop, heappush
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,10 +16,13 @@ import numpy as np
 
 from bridge.bus_load import BitCount
 from bridge.closed import ClosedStation
+from bridge.commander import Commander
 from bridge.frame import Frame
 from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
+from bridge.paced_bus import PacedBus
 from echelon.link import Link
 from echelon.messages import Channel, Message
+from echelon.plan import on_wall_clock
 from echelon.session import Session
 from echelon.wire import count_refusal, data_key, encode, join, watch_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
@@ -36,11 +40,14 @@ class WallBridge:
     """The bridge on a wall clock.  Times are run time, `now` from a clock that starts at 0 with the run."""
 
     def __init__(self, spec: ProcessSpec, session: Session) -> None:
-        plan = spec.plan
+        plan = on_wall_clock(spec.plan)
         self.plan = plan
-        self.station = ClosedStation(plan, spec.can_urls, Path(spec.folder), paired=True)
+        self.station = ClosedStation(
+            plan, spec.can_urls, Path(spec.folder), paired=True, role=Commander(plan, alone=True)
+        )
         self.mail = Mail(plan)
         self._role = self.station.role
+        self._buses = [PacedBus(bus, model) for bus, model in zip(self.station.buses, self._role.buses, strict=True)]
         self._period_ns = plan.stations[0].period_ns
         self._last: list[Message | None] = [None] * len(plan.robots)
         self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period that a robot's torque was last sent in
@@ -57,6 +64,9 @@ class WallBridge:
         ]
         self._flying: list[tuple[int, int, int, Message]] = []
         self.link_lost = 0
+        self._awaited: dict[tuple[int, int], deque[tuple[int, int]]] = {}
+        """By bus and identifier: when torque frames were queued, and of which instant they are"""
+        self.came = 0
         self.latencies = array("q")
         self.epoch_ns = 0
         """When run time 0 is, since 1970"""
@@ -71,12 +81,14 @@ class WallBridge:
         at_ns = self._cycle * self._period_ns
         if self._told < self._cycle - 1 and self._cycle > 0:
             at_ns += self._period_ns // FEEDBACK_SHARE - self._period_ns
-        return min(at_ns, self._flying[0][0]) if self._flying else at_ns
+        if self._flying:
+            at_ns = min(at_ns, self._flying[0][0])
+        return min([at_ns, *(due_ns for bus in self._buses if (due_ns := bus.due_ns) is not None)])
 
     @property
     def listens(self) -> bool:
-        """True while robots are to be told what drives report."""
-        return self._told < self._cycle - 1
+        """True while robots are to be told what drives report, and where every frame is time that the bus is taken."""
+        return self._told < self._cycle - 1 or self.plan.can.paced
 
     def torques(self, now_ns: int) -> None:
         """Takes robots' torques as their links let them arrive, and sends them."""
@@ -103,18 +115,18 @@ class WallBridge:
         before = self._last[message.source]
         if before is None or message.sequence > before.sequence:
             self._last[message.source] = message
+            self.came += 1
             if message.sequence >= now_ns // self._period_ns - 1:  # or else newer ones are on their way
-                self._send_robot(now_ns, message.source, message.sequence)
-            latency_ns = now_ns - message.time_ns
-            self.latencies.append(latency_ns)
-            self.in_time += latency_ns < self._period_ns
+                self._send_robot(now_ns, message.source, message.sequence, message.time_ns)
 
     def frames(self, now_ns: int) -> None:
         """Takes what has come from the buses."""
         for number, bus in enumerate(self.station.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
-                self._role.receive(now_ns, number, frame)
+                self._buses[number].hear(now_ns, frame)
+                if not self._role.buses[number].is_off(BRIDGE_NODE):
+                    self._role.receive(now_ns, number, frame)
                 came_ns = min(received.time_ns - self.epoch_ns, now_ns)  # as the kernel saw it
                 self._note(TimedFrame(came_ns, number, OTHER_NODE, frame))
 
@@ -125,12 +137,13 @@ class WallBridge:
             self._cycle = now_ns // self._period_ns
             for bus, frames in self._role.apply_events(now_ns):
                 for frame in frames:
-                    self._put(now_ns, bus, frame)
+                    self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
             for robot in range(len(self._last)):
                 self._send_robot(now_ns, robot, self._cycle - 1)  # again, if nothing newer came
             for bus, frames in self._role.bus_frames(now_ns):
                 for frame in frames:
-                    self._put(now_ns, bus, frame)
+                    self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
+            self.carry(now_ns)
             self._flush()
             self._cycle += 1
         at = self._cycle - 1
@@ -144,6 +157,18 @@ class WallBridge:
                 if self._watch is not None:
                     self._watch.put(join([payload]))
 
+    def carry(self, now_ns: int) -> None:
+        """Lets buses take what they can have taken by now."""
+        for number, bus in enumerate(self._buses):
+            for queued_ns, end_ns, _, frame in bus.run(now_ns):
+                self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
+                awaited = self._awaited.get((number, frame.can_id), ())
+                while awaited and awaited[0][0] <= queued_ns:
+                    at_ns, state_ns = awaited.popleft()
+                    if at_ns == queued_ns:  # others were lost on the way
+                        self.latencies.append(end_ns - state_ns)
+                        self.in_time += end_ns - state_ns < self._period_ns
+
     def stop(self, now_ns: int) -> None:
         """Takes the torque away from all wheels and disables their drives."""
         self._flush()
@@ -154,11 +179,13 @@ class WallBridge:
         result = self.station.result()
         for row, load in zip(result["buses"], self._loads(), strict=True):
             row["load"] = load
+            if not self.plan.can.paced:
+                row["identifiers"] = {}  # how long its frames take the bus alone knows
         result["load_mean"] = max(row["load"] for row in result["buses"])
         latencies = np.array(self.latencies) / 1e9
         result["torque"] = {
             "periods": len(self._last) * max(0, min(self._cycle, self.plan.duration_ns // self._period_ns + 1)),
-            "came": len(latencies),
+            "came": self.came,
             "in_time": self.in_time,
             "latency_median": float(np.median(latencies)) if len(latencies) else None,
             "latency_p99": float(np.percentile(latencies, 99)) if len(latencies) else None,
@@ -177,18 +204,21 @@ class WallBridge:
         since_s = max(1, self._cycle * self._period_ns + self.plan.can.bring_up_ns) / 1e9
         return [bits.bits / bus.bitrate / since_s for bits, bus in zip(self._bits, self.plan.can.buses, strict=True)]
 
-    def _send_robot(self, now_ns: int, robot: int, cycle: int) -> None:
-        """Sends the newest torque of a robot for a period, once: one that is late goes with the next period's."""
+    def _send_robot(self, now_ns: int, robot: int, cycle: int, state_ns: int | None = None) -> None:
+        """Sends the newest torque of a robot for a period, once: one that is late goes with the next period's.
+
+        `state_ns` is the instant of the state that it was computed from, if it is new."""
         if cycle <= self._sent_in[robot]:
             return
         torques = self._role.robots[robot]
         self._sent_in[robot] = cycle
+        bus = torques.robot.drive.bus
         for frame in torques.frames(now_ns, self._last[robot]):
-            self._put(now_ns, torques.robot.drive.bus, frame)
-
-    def _put(self, now_ns: int, bus: int, frame: Frame) -> None:
-        if self.station.buses[bus].send(frame.can_id, frame.data, remote=frame.remote):
-            self._note(TimedFrame(now_ns, bus, BRIDGE_NODE, frame))
+            queued = self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
+        if queued and state_ns is not None:
+            # What was wanted is on the bus with the last of its frames.
+            self._awaited.setdefault((bus, frame.can_id), deque()).append((now_ns, state_ns))
+        self.carry(now_ns)
 
     def _note(self, timed: TimedFrame) -> None:
         self._frames.append(timed)
@@ -231,6 +261,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         wait_for([control, bridge.mail, *buses], bridge.due_ns - now())
         bridge.frames(now())
         bridge.torques(now())
+        bridge.carry(now())
         bridge.pass_time(now())
         now_ns = now()
         if now_ns - said_ns >= PROGRESS_NS:

@@ -6,11 +6,16 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from bridge.bus import Bus, open_bus
+from bridge.buses import bus_row, make_buses
+from bridge.disturbances import Disturbances
 from bridge.drive_bank import DriveBank
+from bridge.fit import plan_fit
 from bridge.frame import Frame
 from bridge.frame_message import TimedFrame
+from bridge.paced_bus import PacedBus
 from bridge.referee import Referee
 from echelon.messages import Channel
+from echelon.plan import Plan, on_wall_clock
 from echelon.session import Session
 from echelon.wire import data_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
@@ -23,26 +28,23 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
         buses = [open_bus(url) for url in spec.can_urls]
     except (ValueError, OSError) as error:
         raise StartError(str(error)) from None
-    bank, mail = (
-        DriveBank(spec.plan),
-        Mail(spec.plan, wakes=False),
-    )  # how shafts turn is early enough with the next frame
+    drives = WallDrives(spec.plan, buses)
+    mail = Mail(spec.plan, wakes=False)  # how shafts turn is early enough with the next frame
     session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in spec.plan.robots], mail.receive)
     start_ns = meet(spec, session, control)
     until_ns: int | None = None
     while until_ns is None or time.monotonic_ns() < until_ns:
-        serve(bank, buses, start_ns, [control])
+        drives.serve(start_ns, [control])
         for message in mail.take():
-            bank.turn(time.monotonic_ns() - start_ns, message)
+            drives.bank.turn(time.monotonic_ns() - start_ns, message)
         if until_ns is None and control.poll():
             control.recv()
             # Until the drives stopped by themselves if nobody stopped them.
-            until_ns = time.monotonic_ns() + (2 * spec.plan.can.watchdog_ns if bank.turning else 0)
+            until_ns = time.monotonic_ns() + (2 * spec.plan.can.watchdog_ns if drives.bank.turning else 0)
     for bus in buses:
         bus.close()
     cpu_s, resident = resources()
-    failed = sum(bus.counts.failed + bus.counts.dropped for bus in buses)
-    control.send(("done", Result(spec.name, cpu_s, resident, extra=bank.result() | {"failed": failed})))
+    control.send(("done", Result(spec.name, cpu_s, resident, extra=drives.result())))
     control.recv()
 
 
@@ -74,16 +76,51 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -
     control.recv()
 
 
-def serve(bank: DriveBank, buses: Sequence[Bus], start_ns: int, also: Sequence[Any] = ()) -> None:
-    """Waits for what comes next, a frame or an instant of the drives' own, and lets them work; `also` ends the wait too."""
-    wait_for([*also, *buses], bank.due_ns - (time.monotonic_ns() - start_ns))
-    for number, bus in enumerate(buses):
-        for received in drained(bus):
-            now_ns = time.monotonic_ns() - start_ns
-            _send(buses, bank.receive(now_ns, number, Frame(received.can_id, received.data, received.remote)))
-    _send(buses, bank.pass_time(time.monotonic_ns() - start_ns))
+class WallDrives:
+    """The virtual drives of a plan on a wall clock, on all its buses.  Times are run time, `start_ns` when it is 0."""
 
+    def __init__(self, plan: Plan, buses: Sequence[Bus]) -> None:
+        self.plan = on_wall_clock(plan)
+        self.bank = DriveBank(self.plan)
+        models = make_buses(self.plan, part=1)
+        self._buses = [PacedBus(bus, model) for bus, model in zip(buses, models, strict=True)]
+        self._disturbances = Disturbances(self.plan, models, bridge=False)
 
-def _send(buses: Sequence[Bus], frames: Sequence[TimedFrame]) -> None:
-    for _, bus, _, (can_id, data, remote) in frames:
-        buses[bus].send(can_id, data, remote=remote)
+    @property
+    def due_ns(self) -> int:
+        """When there is something to do without anything having come."""
+        return min([self.bank.due_ns, *(due_ns for bus in self._buses if (due_ns := bus.due_ns) is not None)])
+
+    def serve(self, start_ns: int, also: Sequence[Any] = ()) -> None:
+        """Waits for what comes next, a frame or an instant of their own, and lets the drives work; `also` ends the wait too."""
+        wait_for([*also, *(paced.bus for paced in self._buses)], self.due_ns - (time.monotonic_ns() - start_ns))
+        for number, paced in enumerate(self._buses):
+            for received in drained(paced.bus):
+                now_ns = time.monotonic_ns() - start_ns
+                frame = Frame(received.can_id, received.data, received.remote)
+                paced.hear(now_ns, frame)
+                self._send(self.bank.receive(now_ns, number, frame))
+        now_ns = time.monotonic_ns() - start_ns
+        self._send(self.bank.pass_time(now_ns))
+        for paced in self._buses:
+            paced.run(now_ns)
+        self._disturbances.apply(now_ns)
+        if self.plan.can.paced:
+            for placed in self.bank.drives:
+                placed.is_off = self._buses[placed.place.bus].model.is_off(placed.place.node)
+
+    def _send(self, frames: Sequence[TimedFrame]) -> None:
+        for time_ns, bus, node, frame in frames:
+            self._buses[bus].send(time_ns, node, frame)
+
+    def result(self) -> dict[str, Any]:
+        """Returns what there is to say of them for a run's summary."""
+        counts = [paced.bus.counts for paced in self._buses]
+        result = self.bank.result() | {"failed": sum(count.failed + count.dropped for count in counts)}
+        if self.plan.can.paced:
+            fit = plan_fit(self.plan)
+            result["buses"] = [
+                bus_row(self.plan, number, paced.model, fit[number].responses_ns)
+                for number, paced in enumerate(self._buses)
+            ]
+        return result

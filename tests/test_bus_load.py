@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.bus_load import bus_load, explain, frame_bits, many_frame_bits, worst_case_bits
+from bridge.bus_load import bus_load, frame_bits, many_frame_bits, worst_case_bits
 
 
 def by_hand(can_id: int, data: bytes, remote: bool = False) -> int:
@@ -53,8 +53,6 @@ def test_published_numbers() -> None:
 def test_load() -> None:
     assert bus_load(9000, 1_000_000, 130) == pytest.approx(1.17)
     assert bus_load(900, 1_000_000) == pytest.approx(0.1215)
-    assert explain(9, 1000, 1_000_000, 130) == ("does not fit one 1 Mbit/s bus: 9 robots x 1000 Hz x 130 bit = 117 %")
-    assert explain(1, 100, 500_000) == "fits one 500 kbit/s bus: 1 robot x 100 Hz x 135 bit = 2.7 %"
 
 
 def test_refused() -> None:

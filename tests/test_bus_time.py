@@ -12,8 +12,9 @@ from numpy.random import Philox
 
 from bridge.bus_load import frame_bits, worst_case_bits
 from bridge.bus_model import BusEvent, BusEventKind, BusModel, Delivered
-from bridge.bus_time import BusTime, IdealBus
+from bridge.bus_time import BusTime
 from bridge.frame import Frame
+from bridge.ideal_bus import IdealBus
 
 MEGA = 1_000_000
 BIT = 1_000  # ns at 1 Mbit/s

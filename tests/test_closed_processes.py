@@ -6,11 +6,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from subprocess import Popen
+from typing import Any
 
 import pytest
 
 from bridge.bus import Bus, open_bus, resolve_url
+from bridge.bus_load import frame_bits
 from bridge.canlog import read_log
+from bridge.frame_message import BRIDGE_NODE
 from bridge.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
 from sim.joining import ProcessSpec
 from sim.supervisor import Supervisor
@@ -162,3 +165,59 @@ def test_who_is_killed_ends_the_run_without_torque(wall_run: tuple[Popen[str], L
             torque = codec.decode(last.can_id, last.data)
             assert (torque.enable_right, torque.enable_left) == (False, False)  # type: ignore[union-attr]
     assert until(lambda: not session_members(command.pid))
+
+
+def paced_run(folder: Path, *more: str) -> dict[str, Any]:
+    """Runs the lab on a wall clock on a bus that is as slow as a real one; returns what the summary says of the bus."""
+    sets = ["can.path=closed", "can.timing=bits", "duration=2", "claims=[]", *more]
+    arguments = [word for value in sets for word in ("--set", value)]
+    echelon("run", "lab", "--clock", "wall", "--quiet", "--no-report", "--out", folder, *arguments)
+    can: dict[str, Any] = summary_of(folder)["can"]
+    return can
+
+
+def test_on_a_wall_clock_an_overloaded_bus_is_late_and_loses(tmp_path: Path) -> None:
+    bitrate = 125_000
+    can = paced_run(tmp_path / "run", f"can.bitrate={bitrate}", "can.queue=64", "can.bring_up=0.1")
+    (bus,) = can["buses"]
+    assert bus["lost"] > 100
+    assert 0.9 < bus["load"] < 1.01
+    frames = [(frame.time_ns, frame_bits(*frame.frame)) for frame in read_log(tmp_path / "run" / "can.log")]
+    taken_ns = sum(bits for _, bits in frames[1:]) * 1_000_000_000 // bitrate
+    assert 0.8 < taken_ns / (frames[-1][0] - frames[0][0]) < 1.02
+    # Commands have lower identifiers than what drives say: they are held up by themselves alone, those by all of them.
+    commands, feedback = (
+        [bus["identifiers"][f"{first + robot:03X}"] for robot in range(ROBOTS)] for first in (BASE_ID, FEEDBACK_ID)
+    )
+    assert sum(row["lost"] for row in commands) == 0
+    assert sum(row["lost"] for row in feedback) > 0
+    assert max(row["latency_max"] for row in feedback) > 2 * max(row["latency_mean"] for row in commands)
+
+
+@pytest.mark.parametrize("whose", ["bridge", "drive"])
+def test_on_a_wall_clock_errors_come_on_schedule_and_a_controller_that_is_off_comes_back(
+    tmp_path: Path, whose: str
+) -> None:
+    robot = ', robot="g1/r1"' if whose == "drive" else ""
+    events = f'events=[{{kind="error_frames", at=0.2, duration=0.3, rate=0.1}}, {{kind="bus_off", at=1.0{robot}}}]'
+    can = paced_run(tmp_path / "run", events, "robot.drive.recover_after=0.05")
+    (bus,) = can["buses"]
+    assert bus["destroyed"] > 20
+    node, can_id = (BRIDGE_NODE, BASE_ID) if whose == "bridge" else (1, FEEDBACK_ID)
+    off_s, back_s = (event["time"] for event in bus["events"] if event["node"] == node and event["time"] >= 1.0)
+    assert 1.0 <= off_s < 1.2
+    assert 0.1 < back_s - off_s < 0.3
+    times_s = [
+        frame.time_ns / 1e9 - 1.0 for frame in read_log(tmp_path / "run" / "can.log") if frame.frame.can_id == can_id
+    ]
+    assert not [at for at in times_s if off_s + 0.01 < at < back_s - 0.001]
+    assert [at for at in times_s if at > back_s]
+    assert can["referee"]["kinds"]  # it saw that something was missing
+
+
+def test_on_a_wall_clock_a_bus_that_takes_its_own_time_takes_no_orders(tmp_path: Path) -> None:
+    event = 'events=[{kind="bus_off", at=1}]'
+    arguments = ["run", "lab", "--clock", "wall", "--set", "can.path=closed", "--set", event, "--out", tmp_path]
+    done = echelon(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("echelon: events of kind 'bus_off': with --clock wall the bus takes its own time")

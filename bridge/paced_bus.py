@@ -1,0 +1,41 @@
+"""A bus on a wall clock that is as fast as a real one: frames wait in a model of it, and go out when they are over there.
+
+A virtual interface carries any number of frames at once.  Here each process has a model of the bus (bridge.bus_time) with
+its own frames in it, and those it heard of others; it puts a frame on the interface at the end of the time that the frame
+takes in the model.  So all together send no more than the bit rate allows, by priority as far as one can know of the
+others; what finds no room is lost; error frames and bus-off happen in the model.  With an ideal bus for a model,
+frames go out at once: a real bus takes its own time.
+"""
+
+from bridge.bus import Bus
+from bridge.bus_model import BusModel, Delivered
+from bridge.frame import Frame
+
+
+class PacedBus:
+    """A bus and its model.  Times are run time, and never run backwards."""
+
+    def __init__(self, bus: Bus, model: BusModel) -> None:
+        self.bus, self.model = bus, model
+
+    def send(self, time_ns: int, node: int, frame: Frame) -> bool:
+        """Puts a frame into the queue of a node of this process; False: it is lost, and counted in the model."""
+        queued = self.model.send(time_ns, node, frame)
+        if self.model.is_off(node):
+            # A controller that is off takes nothing: what came when it is back would be old.
+            self.model.clear(node)
+            return False
+        return queued
+
+    def hear(self, time_ns: int, frame: Frame) -> None:
+        """Takes note of a frame that came from the bus."""
+        self.model.hear(time_ns, frame)
+
+    def run(self, time_ns: int) -> list[Delivered]:
+        """Sends what is over by now; returns what the bus took."""
+        return [sent for sent in self.model.run(time_ns) if self.bus.send(*sent.frame[:2], remote=sent.frame.remote)]
+
+    @property
+    def due_ns(self) -> int | None:
+        """When `run` is next to be called; None: nothing waits."""
+        return self.model.due_ns

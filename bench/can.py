@@ -20,7 +20,8 @@ import can
 import numpy as np
 
 from bench.product import Row, table
-from bridge.bus import Bus, open_bus, resolve_url
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import resolve_url
 from bridge.commander import Torques
 from bridge.frame import Frame
 from bridge.protocols import drive_places, make_drive

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.bus import resolve_url
+from bridge.bus_url import resolve_url
 from echelon.load import effective_toml, load
 from sim.engine import Engine
 from sim.live import Display

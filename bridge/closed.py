@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.bus import Bus, listen_command, open_bus
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import listen_command
 from bridge.buses import bus_row
 from bridge.canlog import CanLog
 from bridge.commander import Commander

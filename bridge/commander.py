@@ -31,6 +31,7 @@ from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage
 
 _COMMANDED: Final = TORQUE_FIELDS.index("commanded")
+_SATURATED: Final = TORQUE_FIELDS.index("saturated")
 NOT_COMMANDED: Final = "no command"
 """Why a torque is zero besides the reasons of the envelope: the robot said it has none, or nothing (fresh) came from it."""
 
@@ -56,26 +57,30 @@ class Torques:
 
     def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
         """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
-        frames = self.host.poll(time_ns)
+        host = self.host
+        frames = host.poll(time_ns)
         # What a host sends first when drives take torque (again) is zero, whatever is wanted; limits count from there.
-        gives, self._gave = self.host.enabled and self._gave, self.host.enabled
-        tau_right = tau_left = saturated = 0.0
-        commanded = heard is not None and heard.values[_COMMANDED] == 1.0
-        if commanded and not gives:
-            self.envelope.stop(time_ns)
-        elif heard is not None and commanded:
-            tau_right, tau_left, _, saturated = heard.values[:4].tolist()
-            tau_right, tau_left, reason = self.envelope.check(time_ns, heard.time_ns, tau_right, tau_left)
-            if reason is not None:
-                self.stopped[reason] += 1
-            self.largest = max(self.largest, abs(tau_right), abs(tau_left))
-        else:
+        enabled = host.enabled
+        gives, self._gave = enabled and self._gave, enabled
+        tau_right = tau_left = 0.0
+        limited = False
+        if heard is None or (values := heard.values.tolist())[_COMMANDED] != 1.0:
             self.envelope.stop(time_ns)
             if self.spoken or time_ns >= self.robot.drive.watchdog_ns:  # a run begins with nothing said yet
                 self.stopped[NOT_COMMANDED] += 1
+        elif not gives:
+            self.envelope.stop(time_ns)
+        else:
+            tau_right, tau_left, reason = self.envelope.check(time_ns, heard.time_ns, values[0], values[1])
+            limited = values[_SATURATED] > 0
+            if reason is not None:
+                self.stopped[reason] += 1
+            elif (most := max(abs(tau_right), abs(tau_left))) > self.largest:
+                self.largest = most
         self.spoken |= heard is not None
         self.commands += time_ns >= 0
-        return frames + self.host.command(time_ns, tau_right, tau_left, saturated > 0)
+        commands = host.command(time_ns, tau_right, tau_left, limited)
+        return frames + commands if frames else commands
 
     def wheel_torques(self, time_ns: int) -> tuple[float, float]:
         """Returns what the drives last reported [N m], zeros if that is older than their watchdog."""

@@ -8,8 +8,9 @@ from typing import Any, Final
 import numpy as np
 
 from bridge.bridge import Bridge
-from bridge.bus import listen_command, open_bus
+from bridge.bus import open_bus
 from bridge.bus_load import bus_load
+from bridge.bus_url import listen_command
 from bridge.canlog import CanLog
 from bridge.fit import plan_fit
 from bridge.frame_message import BRIDGE_NODE, add_words

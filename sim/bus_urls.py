@@ -1,6 +1,6 @@
 """Where the buses of a run are: what the scenario says, what --can says, and what this machine has."""
 
-from bridge.bus import interface_is_up, resolve_url
+from bridge.bus_url import interface_is_up, resolve_url
 from echelon.plan import Plan
 from sim.usage import UsageError
 

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bridge.bus import Bus, interface_is_up, open_bus, resolve_url
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import interface_is_up, resolve_url
 from bridge.closed import LOG
 from bridge.frame import Frame
 from bridge.referee import Referee, judge_log, read_run_log

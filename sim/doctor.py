@@ -20,7 +20,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from bridge.bus import interface_is_up, open_bus, resolve_url
+from bridge.bus import open_bus
+from bridge.bus_url import interface_is_up, resolve_url
 from echelon.plan import Plan
 from echelon.session import Session, loopback_endpoints
 

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Final
 
-from bridge.bus import Bus, listen_command, open_bus
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import listen_command
 from bridge.drive_bank import DriveBank
 from echelon.drives import identifiers
 from echelon.plan import Plan, RobotPlan

@@ -6,13 +6,17 @@ import struct
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from bridge.bus import Bus, interface_is_up, listen_command, open_bus, resolve_url
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import interface_is_up, listen_command, resolve_url
+from bridge.wires import RawCan
 
 FRAMES = [(0x100 + number % 9, number.to_bytes(8, "little")) for number in range(500)]
 
@@ -115,6 +119,57 @@ def test_frames_arrive_whole_and_in_order(kind: str) -> None:
         assert (receiver.counts.received, receiver.counts.recv_failed, sender.counts.received) == (len(FRAMES), 0, 0)
 
 
+@pytest.fixture
+def multicast() -> Iterator[tuple[Bus, can.BusABC]]:
+    """A bus of ours, and python-can's own on the same group and port."""
+    with open_or_skip(own_url("udp_multicast")) as bus:
+        group, _, port = bus.url.partition(":")[2].rpartition(":")
+        with can.Bus(
+            interface="udp_multicast", channel=group, port=int(port), hop_limit=0, ignore_config=True
+        ) as plain:
+            yield bus, plain
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans())
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_python_can_takes_our_datagrams_and_we_take_its(
+    multicast: tuple[Bus, can.BusABC], can_id: int, data: bytes, remote: bool
+) -> None:
+    bus, plain = multicast
+    data = b"" if remote else data
+    assert bus.send(can_id, data, remote=remote)
+    came = plain.recv(5.0)
+    assert came is not None
+    assert (came.arbitration_id, bytes(came.data), came.dlc) == (can_id, data, len(data))
+    assert (came.is_remote_frame, came.is_extended_id, came.is_error_frame, came.is_fd) == (remote, False, False, False)
+    plain.send(can.Message(arbitration_id=can_id, data=data, is_remote_frame=remote, is_extended_id=False))
+    answer = bus.recv(5.0)  # and not what it sent itself, though it is the same
+    assert answer is not None
+    assert (answer.can_id, answer.data, answer.remote) == (can_id, data, remote)
+    assert abs(answer.time_ns - time.time_ns()) < 60_000_000_000
+    assert plain.recv(5.0) is not None  # python-can does hear itself
+
+
+def test_what_is_no_frame_for_us_is_counted_or_passed_over(multicast: tuple[Bus, can.BusABC]) -> None:
+    bus, plain = multicast
+    for other in ({"is_extended_id": True}, {"is_error_frame": True, "is_extended_id": False}):
+        plain.send(can.Message(arbitration_id=5, **other))
+    group, _, port = bus.url.partition(":")[2].rpartition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        for junk in (b"", b"junk", bytes(3000), b"\x80", b"\x81\xaearbitration_id\xa3abc"):
+            stranger.sendto(junk, (group, int(port)))
+    plain.send(can.Message(arbitration_id=7, is_extended_id=False))
+    got = []
+    while not got or got[-1] is None:
+        got.append(bus.recv(5.0))
+        assert len(got) < 20
+    assert got[-1] is not None
+    assert got[-1].can_id == 7
+    assert bus.counts.recv_failed == len(got) - 1 >= 4
+    assert bus.counts.received == 1
+
+
 def test_a_receiver_keeps_earlier_frames_when_later_ones_are_sent() -> None:
     with open_bus(own_url("virtual")) as sender, open_bus(sender.url) as receiver:
         sender.send(1, b"first")
@@ -160,8 +215,8 @@ class Socket:
 
 def raw_bus(answers: list[int], bind: int = 0) -> tuple[Bus, Socket, list[float]]:
     raw, pauses = Socket(answers, bind), list[float]()
-    bus = Bus(can.Bus(interface="virtual", channel=str(uuid.uuid4())), "socketcan:vcan0", pauses.append)
-    bus._socket = raw  # type: ignore[assignment]
+    plain = can.Bus(interface="virtual", channel=str(uuid.uuid4()))
+    bus = Bus(plain, "socketcan:vcan0", RawCan(raw), pauses.append)  # type: ignore[arg-type]
     return bus, raw, pauses
 
 
@@ -184,7 +239,7 @@ def test_receiving_on_a_raw_socket() -> None:
     bus, _, _ = raw_bus([])
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ours, theirs:
-        bus._socket = ours
+        bus._wire = RawCan(ours)
         assert bus.recv(0.0) is None
         for can_id in (0x80000123, 0x20000004, 0x40000105, 0x7FF):  # extended, error, remote, plain
             theirs.send(kernel_frame(can_id, b"0123"))
@@ -205,7 +260,7 @@ def test_waiting_on_a_raw_socket_ends_with_a_frame_or_with_the_time() -> None:
     bus, _, _ = raw_bus([])
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ours, theirs:
-        bus._socket = ours
+        bus._wire = RawCan(ours)
         begun_s = time.monotonic()
         assert bus.recv(0.05) is None
         assert time.monotonic() - begun_s >= 0.05
@@ -224,8 +279,9 @@ def test_waiting_on_a_raw_socket_ends_with_a_frame_or_with_the_time() -> None:
 
 def test_trouble_while_receiving_on_a_raw_socket_is_counted() -> None:
     bus, _, _ = raw_bus([])
-    bus._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    bus._socket.close()
+    closed = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    closed.close()
+    bus._wire = RawCan(closed)
     assert bus.recv(None) is None
     assert bus.counts.recv_failed == 1
     assert isinstance(bus.error, OSError)

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from bridge.bus import Bus, open_bus, resolve_url
+from bridge.bus import Bus, open_bus
 from bridge.bus_load import frame_bits
+from bridge.bus_url import resolve_url
 from bridge.canlog import read_log
 from bridge.frame_message import BRIDGE_NODE
 from bridge.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from runs import echelon, plan_of
 
-from bridge.bus import open_bus, resolve_url
+from bridge.bus import open_bus
+from bridge.bus_url import resolve_url
 from sim import doctor
 from sim.doctor import Finding, Measured
 

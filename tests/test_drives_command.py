@@ -8,7 +8,8 @@ from subprocess import Popen
 import pytest
 from runs import echelon, kill_session, plan_of, start_echelon
 
-from bridge.bus import Bus, open_bus, resolve_url
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import resolve_url
 from bridge.frame import Frame, Host
 from bridge.protocols import make_host
 from sim.drives_command import describe

@@ -80,10 +80,10 @@ class NativeHost:
         if self.torque_ns is not None and time_ns - self.torque_ns >= self._plan.watchdog_ns:
             self._states = _DISABLED
             self._fail(time_ns, SILENT)
-        recover_ns = recovers_after_ns(self._plan, time_ns)
-        waited = self._fault and recover_ns is not None and time_ns - self._fault_ns >= recover_ns
-        if waited and self._started and self._clearing_ns is None:
-            self._clearing_ns = time_ns
+        if self._fault and self._started and self._clearing_ns is None:
+            recover_ns = recovers_after_ns(self._plan, time_ns)
+            if recover_ns is not None and time_ns - self._fault_ns >= recover_ns:
+                self._clearing_ns = time_ns
         return []
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:

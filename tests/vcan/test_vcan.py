@@ -13,7 +13,8 @@ import pytest
 
 from bench.can import bus_rates
 from bridge.bridge import Bridge, Frame
-from bridge.bus import Bus, listen_command, open_bus, resolve_url
+from bridge.bus import Bus, open_bus
+from bridge.bus_url import listen_command, resolve_url
 from bridge.dbc import torque_dbc
 from bridge.native.codec import NativeCodec, Torque
 from sim.doctor import check_interfaces, check_vcan

@@ -1,0 +1,107 @@
+"""URLs of CAN buses: what they say, and what `auto` stands for on this machine.
+
+socketcan:vcan0                      an interface of the kernel
+udp_multicast:[group][:port]         several processes on one host without privileges; 239.74.163.2 and 43113 unless
+                                     given, an IPv6 group in brackets
+virtual[:channel]                    inside this process
+auto                                 socketcan:vcan0 where that exists and is up, else udp_multicast on a free port
+"""
+
+import fcntl
+import ipaddress
+import re
+import socket
+import struct
+from dataclasses import dataclass
+
+ALLOWED = "socketcan:INTERFACE, udp_multicast:[GROUP][:PORT], virtual[:CHANNEL] or auto"
+DEFAULT_GROUP = "239.74.163.2"
+DEFAULT_PORT = 43113
+DEFAULT_INTERFACE = "vcan0"
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where a bus is: the kind of interface, its name or the multicast group, and the port of the latter."""
+
+    interface: str
+    channel: str
+    port: int = 0
+
+    def __str__(self) -> str:
+        if self.interface != "udp_multicast":
+            return f"{self.interface}:{self.channel}"
+        group = f"[{self.channel}]" if ":" in self.channel else self.channel
+        return f"{self.interface}:{group}:{self.port}"
+
+
+def resolve_url(url: str, number: int = 0) -> str:
+    """The URL in full, with what `auto` stands for here and now, to be handed to all processes that share the bus.
+
+    Of several buses number 1 looks for vcan1, and so on. Raises ValueError for a URL that is none."""
+    if url == "auto" and number:
+        return resolve_url(
+            f"socketcan:vcan{number}" if interface_is_up(f"vcan{number}") else f"udp_multicast::{_free_port()}"
+        )
+    return str(parse(url))
+
+
+def listen_command(url: str) -> str:
+    """What to type to see the frames of a bus; empty for one that is not visible from outside. ValueError as above."""
+    address = parse(url)
+    if address.interface == "socketcan":
+        return f"candump {address.channel}"
+    if address.interface == "udp_multicast":
+        return f"can_logger -i udp_multicast -c {address.channel} --bus-kwargs port={address.port}"
+    return ""
+
+
+def parse(url: str) -> Address:
+    """Returns where a URL leads.  Raises ValueError for a URL that is none."""
+    if url == "auto":
+        if interface_is_up(DEFAULT_INTERFACE):
+            return Address("socketcan", DEFAULT_INTERFACE)
+        return Address("udp_multicast", DEFAULT_GROUP, _free_port())
+    interface, _, rest = url.partition(":")
+    if interface == "socketcan":
+        if not re.fullmatch(r"[^\s/:]{1,15}", rest):
+            raise ValueError(f"CAN URL {url!r}: {rest!r} is no interface name; allowed: {ALLOWED}")
+        return Address(interface, rest)
+    if interface == "virtual":
+        return Address(interface, rest or "echelon")
+    if interface != "udp_multicast":
+        raise ValueError(f"CAN URL {url!r}: {interface!r} is not known; allowed: {ALLOWED}")
+    parts = re.fullmatch(r"(?:\[(.*)\]|([^:\[\]]*))(?::([0-9]{1,5})?)?", rest)
+    if parts is None:
+        raise ValueError(f"CAN URL {url!r}: {rest!r} is not [GROUP][:PORT], IPv6 in brackets; allowed: {ALLOWED}")
+    group = parts[1] or parts[2] or DEFAULT_GROUP
+    port = int(parts[3] or DEFAULT_PORT)
+    try:
+        multicast = ipaddress.ip_address(group).is_multicast
+    except ValueError:
+        multicast = False
+    if not multicast:
+        raise ValueError(f"CAN URL {url!r}: {group!r} is no multicast address; allowed: {ALLOWED}")
+    if not 0 < port < 65536:
+        raise ValueError(f"CAN URL {url!r}: port {port} is not 1 .. 65535; allowed: {ALLOWED}")
+    return Address(interface, group, port)
+
+
+def interface_is_up(name: str) -> bool:
+    """Whether a network interface of this name exists and is up."""
+    request = struct.pack("16sH14x", name.encode()[:15], 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        try:
+            answer = fcntl.ioctl(any_socket, 0x8913, request)  # SIOCGIFFLAGS
+        except OSError:
+            return False
+    return bool(struct.unpack("16xH14x", answer)[0] & 1)  # IFF_UP
+
+
+def _free_port() -> int:
+    port = DEFAULT_PORT  # which is for those who ask for it
+    while port == DEFAULT_PORT:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("", 0))
+            port = probe.getsockname()[1]
+    return port

@@ -1,13 +1,30 @@
 """The DBC of a plan: every frame of every robot's drives on one bus, for candump, cantools, SavvyCAN.  Pure."""
 
+import re
+from collections.abc import Sequence
 from typing import Any
 
 from cantools.database import Database
 from cantools.database.can import Node
 
-from bridge.dbc import identifiers
+from bridge.native.dbc import KINDS
 from bridge.protocols import dbc_messages
 from echelon.plan import Plan
+
+_LONGEST = 32 - len("_") - max(map(len, KINDS))  # a DBC identifier has at most 32 characters
+
+
+def identifiers(robots: Sequence[str]) -> list[str]:
+    """A valid DBC identifier for each robot's path name: g1/r3 becomes g1_r3, cut to fit, made unique by a number."""
+    names: list[str] = []
+    for robot in robots:
+        plain = re.sub(r"\W", "_", robot, flags=re.ASCII)[:_LONGEST]
+        name, number = plain, 2
+        while name in names:
+            suffix = f"_{number}"
+            name, number = plain[: _LONGEST - len(suffix)] + suffix, number + 1
+        names.append(name)
+    return names
 
 
 def plan_dbc(plan: Plan, bus: int = 0) -> str:

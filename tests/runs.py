@@ -69,6 +69,13 @@ def _alive() -> list[tuple[int, int, int]]:
     return found
 
 
+def lab_dbc(torque_scale: float = 0.001) -> str:
+    """Returns the DBC of lab.toml's robots, g1/r1 to g3/r9, with native drives."""
+    from bridge.plan_dbc import plan_dbc
+
+    return plan_dbc(plan_of("lab", f"can.torque_scale={torque_scale!r}"))
+
+
 def session_members(session: int) -> list[int]:
     """Returns the processes of a session that are alive."""
     return [pid for pid, _, of in _alive() if of == session]

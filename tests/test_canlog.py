@@ -12,8 +12,8 @@ import can
 import pytest
 
 from bridge.canlog import FLUSH_NS, CanLog
-from bridge.dbc import torque_dbc
 from bridge.native.codec import NativeCodec, frame_id
+from tests.runs import lab_dbc
 
 EPOCH = 1_700_000_000_000_000_000
 DATA = bytes.fromhex("e80324fa010700f3")
@@ -85,7 +85,7 @@ def test_python_can_reads_it(tmp_path: Path) -> None:
 def test_cantools_decodes_it(tmp_path: Path) -> None:
     path, dbc = tmp_path / "can.log", tmp_path / "torque.dbc"
     write_some(path)
-    dbc.write_text(torque_dbc(["g1/r1", "g1/r2"], 0.001))
+    dbc.write_text(lab_dbc())
     with path.open() as log:
         command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)]
         run = subprocess.run(command, stdin=log, capture_output=True, text=True, check=True, timeout=60)

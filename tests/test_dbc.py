@@ -9,12 +9,11 @@ import cantools
 import pytest
 from cantools.database.can import Database
 
-from bridge.dbc import identifiers, torque_dbc
 from bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status, frame_id
-from bridge.native.dbc import messages
-from tests.bench_drives import drive_plan
+from bridge.plan_dbc import identifiers
+from tests.runs import lab_dbc
 
-ROBOTS = ["g1/r1", "g1/r2", "g2/r1"]
+ROBOTS = [f"g{1 + number // 3}_r{1 + number}" for number in range(9)]
 
 
 def load(text: str) -> Database:
@@ -24,20 +23,19 @@ def load(text: str) -> Database:
 
 
 def test_fields_units_and_ranges() -> None:
-    database = load(torque_dbc(ROBOTS, 0.001, 10_000_000))
+    database = load(lab_dbc())
     names = {message.frame_id: message.name for message in database.messages}
     kinds = {0x100: "torque", 0x180: "feedback", 0x200: "status"}
-    robots = ("g1_r1", "g1_r2", "g2_r1")
-    assert names == {base + at: f"{kind}_{name}" for base, kind in kinds.items() for at, name in enumerate(robots)}
+    assert names == {base + at: f"{kind}_{name}" for base, kind in kinds.items() for at, name in enumerate(ROBOTS)}
     assert [database.get_message_by_frame_id(base + 1).cycle_time for base in kinds] == [10, 10, 100]
-    assert database.get_message_by_frame_id(0x182).senders == ["drive_g2_r1"]
+    assert database.get_message_by_frame_id(0x182).senders == ["drive_g1_r3"]
     message = database.get_message_by_frame_id(frame_id(2))
     assert (message.length, message.cycle_time, message.senders) == (8, 10, ["bridge"])
     assert message.comment is not None
-    assert "g2/r1" in message.comment
+    assert "g1_r3" in message.comment
     for name in ("tau_right", "tau_left"):
         signal = message.get_signal_by_name(name)
-        assert (signal.unit, signal.scale, signal.receivers) == ("Nm", 0.001, ["drive_g2_r1"])
+        assert (signal.unit, signal.scale, signal.receivers) == ("Nm", 0.001, ["drive_g1_r3"])
         assert (signal.minimum, signal.maximum) == pytest.approx((-32.767, 32.767))
 
 
@@ -45,7 +43,7 @@ def test_fields_units_and_ranges() -> None:
 def test_decodes_what_the_codec_encodes(scale: float) -> None:
     codec = NativeCodec(scale)
     data, _ = codec.encode(1, 123 * scale, -456 * scale, 9, saturated=True)
-    message = load(torque_dbc(ROBOTS, scale)).get_message_by_frame_id(0x101)
+    message = load(lab_dbc(scale)).get_message_by_frame_id(0x101)
     values = message.decode(data, decode_choices=False)
     assert isinstance(values, dict)
     assert values.pop("tau_right") == pytest.approx(123 * scale, rel=1e-12)
@@ -55,7 +53,7 @@ def test_decodes_what_the_codec_encodes(scale: float) -> None:
 
 
 def test_decodes_what_drives_say() -> None:
-    database = load(torque_dbc(ROBOTS, 0.01))
+    database = load(lab_dbc(0.01))
     states, faults = (WheelState.ENABLED, WheelState.FAULT), (FaultCode.NONE, FaultCode.BROWN_OUT)
     data = NativeCodec(0.01).encode_feedback(Feedback(2, (0.25, -1.5), states, faults, 7))
     values = database.decode_message(0x182, data)
@@ -81,38 +79,21 @@ def test_decodes_what_drives_say() -> None:
     }
 
 
-def test_messages_of_a_plan_are_the_same() -> None:
-    database = load(torque_dbc(ROBOTS, 0.001, 10_000_000))
-    for message in messages(drive_plan("native"), "g1_r2", 1):
-        other = database.get_message_by_name(message.name)
-        assert (message.frame_id, message.cycle_time) == (other.frame_id, other.cycle_time)
-        fields = [(signal.name, signal.start, signal.length, signal.scale) for signal in message.signals]
-        assert fields == [(signal.name, signal.start, signal.length, signal.scale) for signal in other.signals]
-
-
 def test_names_are_valid_short_and_unique() -> None:
     paths = ["g1/r1", "g1_r1", "g1.r1", "a" * 40, "a" * 41, "größe/1", "7"]
     names = identifiers(paths)
     assert names[:3] == ["g1_r1", "g1_r1_2", "g1_r1_3"]
     assert len(set(names)) == len(paths)
     assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,31}", f"feedback_{name}") for name in names)
-    assert len({message.name for message in load(torque_dbc(paths, 0.001)).messages}) == 3 * len(paths)
-
-
-def test_refused() -> None:
-    with pytest.raises(ValueError, match="127 robots"):
-        torque_dbc(["r"] * 128, 0.001)
-    with pytest.raises(ValueError, match="torque scale"):
-        torque_dbc(ROBOTS, 0.0)
 
 
 def test_cantools_decode_shows_newton_metres(tmp_path: Path) -> None:
     dbc = tmp_path / "torque.dbc"
-    dbc.write_text(torque_dbc(ROBOTS, 0.001))
+    dbc.write_text(lab_dbc())
     data, _ = NativeCodec(0.001).encode(2, 1.25, -0.75, 4)
     command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)]
     # a log file, and what candump shows
     for line in (f"(1700000000.010000) vcan0 102#{data.hex().upper()}", f"  vcan0  102   [8]  {data.hex(' ').upper()}"):
         run = subprocess.run(command, input=line + "\n", capture_output=True, text=True, check=True, timeout=60)
         assert run.stdout.startswith(line)
-        assert "torque_g2_r1(tau_right: 1.25 Nm, tau_left: -0.75 Nm, enable_right: 1, enable_left: 1," in run.stdout
+        assert "torque_g1_r3(tau_right: 1.25 Nm, tau_left: -0.75 Nm, enable_right: 1, enable_left: 1," in run.stdout

@@ -41,17 +41,10 @@ def messages(plan: DrivePlan, name: str, number: int) -> list[Message]:
     """The command, feedback and status of robot number `number`; `name` is an identifier of 23 characters at most.
 
     Raises ValueError for a torque scale that is not positive and finite, or a number out of range."""
-    return make_messages(plan.torque_scale, name, number, plan.period_ns)
-
-
-def make_messages(scale: float, name: str, number: int, period_ns: int | None = None, robot: str = "") -> list[Message]:
-    """The same for a torque scale [N m per bit] and a period [ns]; `robot` is what comments call the robot."""
-    NativeCodec(scale)  # which checks the scale
-    robot = robot or name
-    drive = drive_node(name)
+    scale = NativeCodec(plan.torque_scale).scale  # which checks it
+    drive = f"drive_{name}"
 
     def message(base: int, kind: str, signals: list[Signal], comment: str, sender: str, every: int = 1) -> Message:
-        cycle = None if period_ns is None else math.ceil(period_ns * every / 1_000_000)
         return Message(
             frame_id(number, base),
             f"{kind}_{name}",
@@ -59,7 +52,7 @@ def make_messages(scale: float, name: str, number: int, period_ns: int | None = 
             signals,
             comment=comment,
             senders=[sender],
-            cycle_time=cycle,
+            cycle_time=math.ceil(plan.period_ns * every / 1_000_000),
         )
 
     def wheels(quantity: str, step: float, unit: str, what: str, receiver: str) -> list[Signal]:
@@ -113,15 +106,10 @@ def make_messages(scale: float, name: str, number: int, period_ns: int | None = 
         *ends(BRIDGE),
     ]
     return [
-        message(BASE_ID, KINDS[0], command, f"wheel torques of {robot}, one frame per acceleration period", BRIDGE),
-        message(FEEDBACK_ID, KINDS[1], feedback, f"what the wheels of {robot} do, one frame per period", drive),
-        message(STATUS_ID, KINDS[2], status, f"how the drive of {robot} is", drive, STATUS_EVERY),
+        message(BASE_ID, KINDS[0], command, f"wheel torques of {name}, one frame per acceleration period", BRIDGE),
+        message(FEEDBACK_ID, KINDS[1], feedback, f"what the wheels of {name} do, one frame per period", drive),
+        message(STATUS_ID, KINDS[2], status, f"how the drive of {name} is", drive, STATUS_EVERY),
     ]
-
-
-def drive_node(name: str) -> str:
-    """What the DBC calls a robot's drive."""
-    return f"drive_{name}"
 
 
 def _field(

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from bridge.bus import open_bus
-from bridge.dbc import torque_dbc
 from bridge.frame import Frame
 from bridge.motor import Fault
 from bridge.native.codec import FaultCode, Feedback, NativeCodec, WheelState
 from bridge.native.drive import NativeDrive
 from bridge.native.host import NativeHost
 from tests.bench_drives import MS, Bench, drive_plan
+from tests.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan
 
@@ -132,7 +132,7 @@ def test_our_host_brings_the_drive_up(bench: Bench) -> None:
 def test_candump_and_cantools_show_what_the_drive_says(bench: Bench, client: Client, tmp_path: Path) -> None:
     client.hold(0.0, 0.0, lambda said: said.states == (ON, ON))
     dbc = tmp_path / "native.dbc"
-    dbc.write_text(torque_dbc(["a", "b", "c", "g1/r4"], PLAN.torque_scale, PLAN.period_ns))
+    dbc.write_text(lab_dbc(PLAN.torque_scale))
     with (
         subprocess.Popen(["candump", "vcan0", "-n", "60", "-T", "10000"], stdout=subprocess.PIPE) as one,
         subprocess.Popen(
@@ -150,7 +150,7 @@ def test_candump_and_cantools_show_what_the_drive_says(bench: Bench, client: Cli
         shown = two.communicate(timeout=50)[0].splitlines()
     assert len(shown) == 60
     assert {found[1] for line in shown if (found := re.search(r":: (\w+)\(", line))} == {
-        f"{kind}_g1_r4" for kind in ("torque", "feedback", "status")
+        f"{kind}_g2_r4" for kind in ("torque", "feedback", "status")
     }
     said = [line for line in shown if "mean_tau_right: 0.375 Nm, mean_tau_left: -0.125 Nm" in line]
     assert len(said) > 10

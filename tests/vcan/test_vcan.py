@@ -15,13 +15,13 @@ from bench.can import bus_rates
 from bridge.bridge import Bridge, Frame
 from bridge.bus import Bus, open_bus
 from bridge.bus_url import listen_command, resolve_url
-from bridge.dbc import torque_dbc
 from bridge.native.codec import NativeCodec, Torque
 from sim.doctor import check_interfaces, check_vcan
+from tests.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan
 
-ROBOTS = [f"g{group}/r{robot}" for group in (1, 2, 3) for robot in (1, 2, 3)]
+ROBOTS = [f"g{1 + number // 3}/r{1 + number}" for number in range(9)]
 STEPS = 250
 SCALE = 0.001
 
@@ -88,7 +88,7 @@ def somebody_listens() -> bool:
 
 def test_candump_and_cantools_show_newton_metres(bus: Bus, tmp_path: Path) -> None:
     dbc = tmp_path / "torque.dbc"
-    dbc.write_text(torque_dbc(ROBOTS, SCALE, 10_000_000))
+    dbc.write_text(lab_dbc(SCALE))
     total = STEPS * len(ROBOTS)
     # as a user types it, but for its end: after all frames, or ten seconds of silence
     with (

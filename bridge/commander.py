@@ -233,7 +233,7 @@ class Commander:
         stopped = {robot for event in self._estops.at(time_ns)[0] for robot in event.robots}
         for robot in sorted(stopped - self._stopped):
             torques = self.robots[robot]
-            frames.append((torques.robot.drive.bus, torques.host.stop(time_ns)))
+            frames.append((torques.robot.drive.bus, torques.host.estop(time_ns)))
         for robot in self._stopped - stopped:
             self.robots[robot].host.start()
         self._stopped = stopped

@@ -91,8 +91,11 @@ class Host(Protocol):
     def stop(self, time_ns: int) -> list[Frame]:
         """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
 
+    def estop(self, time_ns: int) -> list[Frame]:
+        """Returns the protocol's own emergency stop: drives take the torque away by themselves; they stay so until `start`."""
+
     def start(self) -> None:
-        """Lets `poll` enable the drives (again).  A new host is started."""
+        """Lets `poll` enable the drives (again), whatever was wrong until then.  A new host is started."""
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""

@@ -135,7 +135,8 @@ class DriveFault(Table):
 
 
 class Estop(Table):
-    """Emergency stop: the bridge takes the torque away and disables the drives, for good unless it has a `duration`."""
+    """Emergency stop, each protocol's own (the native flag, ODrive's Estop, CiA 402's quick stop): drives take the torque away
+    by themselves and stay disabled, for good unless it has a `duration`."""
 
     kind: Literal["estop"]
     at: SecondsOrZero

@@ -222,9 +222,23 @@ def test_stuck_torque_stays_and_a_silent_drive_gives_none() -> None:
     assert not any(row[3].any() for time_ns, row in heard.got.items() if time_ns > 620 * MS)
 
 
-def test_an_estop_stops_its_robots_for_as_long_as_it_lasts() -> None:
+ESTOPS = {
+    "native": [(0x100 + robot, lambda data: data[4] & 32) for robot in range(3)],
+    "odrive": [(node << 5 | 2, lambda data: True) for node in range(1, 7)],
+    "cia402": [(0x200 + node, lambda data: data[:2] == b"\x02\x00") for node in range(1, 7)],
+}
+"""Identifiers of g1's e-stops, and what makes a frame one"""
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_an_estop_stops_its_robots_for_as_long_as_it_lasts(protocol: str) -> None:
     heard = Heard()
-    ran(closed('events=[{kind="estop", robot="g1/*", at=0.5, duration=0.5}]'), heard)
+    drive, event = f"robot.drive.protocol={protocol}", 'events=[{kind="estop", robot="g1/*", at=0.5, duration=0.5}]'
+    ran(closed(event, drive, "can.bitrate=1000000"), heard)
+    said = [timed for _, timed in heard.frames if timed.node == BRIDGE_NODE]
+    for can_id, is_estop in ESTOPS[protocol]:
+        (estop,) = [one for one in said if one.frame.can_id == can_id and is_estop(one.frame.data)]
+        assert 500 * MS < estop.time_ns < 510 * MS  # lower identifiers go first
     got = {time_ns: np.abs(row) for time_ns, row in heard.got.items()}
     assert not any(row[:3].any() for time_ns, row in got.items() if 520 * MS < time_ns < 1000 * MS)
     assert any(row[:3].any() for time_ns, row in got.items() if time_ns > 1200 * MS)

@@ -114,17 +114,26 @@ class Cia402Host:
 
     def stop(self, time_ns: int) -> list[Frame]:
         """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
+        return self._halt(time_ns, Command.DISABLE_VOLTAGE)
+
+    def estop(self, time_ns: int) -> list[Frame]:
+        """Returns frames that make the drives stop quickly; `poll` then disables them, and they stay so until `start`."""
+        return self._halt(time_ns, Command.QUICK_STOP)
+
+    def _halt(self, time_ns: int, command: Command) -> list[Frame]:
         self._started = self._ready = False
         return [
             frame
             for wheel in self._wheels
             if wheel.nmt is Nmt.OPERATIONAL
-            for frame in (wheel.target(0.0), wheel.control(time_ns, Command.DISABLE_VOLTAGE))
+            for frame in (wheel.target(0.0), wheel.control(time_ns, command))
         ]
 
     def start(self) -> None:
-        """Lets `poll` enable the drives (again).  A new host is started."""
+        """Lets `poll` enable the drives (again), whatever was wrong until then.  A new host is started."""
         self._started = True
+        for wheel in self._wheels:
+            wheel.recover()
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""

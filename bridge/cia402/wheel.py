@@ -126,13 +126,16 @@ class Wheel:
     def _recover(self, time_ns: int) -> bool:
         """Whether something may be done about the fault now."""
         after_ns = recovers_after_ns(self.plan, time_ns)
-        if after_ns is None or time_ns - self.fault_ns < after_ns:
-            return False
-        if not self.recovering:
+        if after_ns is not None and time_ns - self.fault_ns >= after_ns:
+            self.recover()
+        return self.recovering
+
+    def recover(self) -> None:
+        """Lets `poll` clear what is wrong, and enable the drive anew."""
+        if self.fault and not self.recovering:
             self.recovering = True
             if self.state is not State.FAULT:
                 self.bring_up()
-        return True
 
     def _configure(self, time_ns: int) -> list[Frame]:
         frames = []

@@ -20,7 +20,7 @@ from bridge.native.codec import (
     decode_status,
     frame_id,
 )
-from echelon.can_plan import DrivePlan
+from echelon.can_plan import NEVER_NS, DrivePlan
 
 SILENT: Final = "silent"
 REMOTE: Final = "remote"
@@ -63,6 +63,8 @@ class NativeHost:
         self._clearing_ns: int | None = None  # since when commands clear
         self._status_counter = CounterCheck()
         self._started = True
+        self._starts = False  # `start` was called, and `poll` not yet
+        self._old_until_ns = -NEVER_NS  # faults noticed by then are from before a start
         self._sent = 0
 
     @property
@@ -80,8 +82,10 @@ class NativeHost:
         if self.torque_ns is not None and time_ns - self.torque_ns >= self._plan.watchdog_ns:
             self._states = _DISABLED
             self._fail(time_ns, SILENT)
+        if self._starts:
+            self._starts, self._old_until_ns = False, time_ns + self._plan.watchdog_ns
         if self._fault and self._started and self._clearing_ns is None:
-            recover_ns = recovers_after_ns(self._plan, time_ns)
+            recover_ns = 0 if self._fault_ns <= self._old_until_ns else recovers_after_ns(self._plan, time_ns)
             if recover_ns is not None and time_ns - self._fault_ns >= recover_ns:
                 self._clearing_ns = time_ns
         return []
@@ -113,8 +117,8 @@ class NativeHost:
         return self._send(0.0, 0.0, enable=False, estop=True)
 
     def start(self) -> None:
-        """Lets the wheels be enabled (again)."""
-        self._started = True
+        """Lets the wheels be enabled (again), whatever was wrong until then."""
+        self._started = self._starts = True
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes feedback or status."""

@@ -447,23 +447,53 @@ def test_stuck_torque_stays_whatever_is_commanded(name: str) -> None:
     assert rig.torques() == [0.0, 0.0]
 
 
-def test_stop_takes_the_torque_and_start_gives_it_back(name: str) -> None:
+@pytest.mark.parametrize("how", ["stop", "estop"])
+@pytest.mark.parametrize("faulty", [False, True])
+def test_stop_takes_the_torque_and_start_gives_it_back(name: str, how: str, faulty: bool) -> None:
+    """Also if something was wrong until then, though a fault in between is never cleared by itself here."""
     rig = enabled_rig(name)
-    rig.to_drives(rig.time_ns, rig.host.stop(rig.time_ns))
+    if faulty:
+        rig.inject(0, Fault.ENCODER_LOSS)
+        rig.cycles(5, 0.5, -0.25)
+        rig.mend(0, Fault.ENCODER_LOSS)
+        rig.cycles(CYCLES, 0.5, -0.25)
+        assert rig.host.fault != ""
+    rig.to_drives(rig.time_ns, rig.host.stop(rig.time_ns) if how == "stop" else rig.host.estop(rig.time_ns))
     assert rig.torques() == [0.0, 0.0]
     assert not rig.host.enabled
     for _ in range(CYCLES):
         rig.cycle(0.5, -0.25)
         assert rig.torques() == [0.0, 0.0]
         assert not rig.host.enabled
-    assert rig.host.fault == ""
+    if not faulty and how == "stop":
+        assert rig.host.fault == ""
     rig.host.start()
     refused = rig.refused()
-    for _ in range(CYCLES):
+    for _ in range(2 * CYCLES):
         rig.cycle(0.5, -0.25)
     assert rig.host.enabled
+    assert rig.host.fault == ""
     assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
     assert rig.refused() == refused
+    rig.inject(1, Fault.ENCODER_LOSS)
+    rig.cycle(0.5, -0.25)
+    rig.mend(1, Fault.ENCODER_LOSS)
+    rig.cycles(2 * CYCLES, 0.5, -0.25)
+    assert rig.host.fault != ""  # what goes wrong later stays
+    assert not rig.host.enabled
+
+
+@pytest.mark.parametrize("cycles", [0, 1, 2, 3])
+def test_an_estop_that_is_over_at_once(name: str, cycles: int) -> None:
+    """Its fault is known to the host only after the start."""
+    rig = enabled_rig(name)
+    rig.to_drives(rig.time_ns, rig.host.estop(rig.time_ns))
+    assert rig.torques() == [0.0, 0.0]
+    rig.cycles(cycles, 0.5, -0.25)
+    rig.host.start()
+    rig.cycles(2 * CYCLES, 0.5, -0.25)
+    assert rig.host.enabled
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
 
 
 def test_a_host_that_begins_anew(name: str) -> None:

@@ -28,7 +28,6 @@ _TRIES = 10
 _AT_ONCE = int(socket.MSG_DONTWAIT)
 _PAUSE = 0.0005  # [s]; with _TRIES, one full queue holds the caller up for 5 ms at most
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
-_GONE = (errno.ENXIO, errno.ENODEV)
 
 
 class Received(NamedTuple):
@@ -82,7 +81,7 @@ def open_bus(url: str) -> "Bus":
 
 def _wire(bus: can.BusABC, address: Address) -> Wire | None:
     if isinstance(bus, SocketcanBus):
-        wire: Wire = RawCan(bus.socket)
+        wire: Wire = RawCan(bus.socket, address.channel)
     elif address.interface == "udp_multicast":
         wire = Datagrams(bus.fileno(), address.channel, address.port)
     else:
@@ -123,11 +122,12 @@ class Bus:
         """Sends a frame, a remote one if `remote`; false if it was not accepted, which is counted. Blocks for 5 ms at most.
 
         `time_ns` is the time stamp that receivers on a virtual bus see; other buses put their own.
-        Raises ValueError for an identifier of more than 11 bits or more than 8 bytes."""
-        if can_id >> 11 or len(data) > 8:
-            raise ValueError(f"no classic CAN frame with an 11-bit identifier: {can_id:#x}, {len(data)} bytes")
+        Raises ValueError for an identifier of more than 11 bits, more than 8 bytes, or a remote frame with data."""
+        if can_id >> 11 or len(data) > 8 or (remote and data):
+            what = "remote frame" if remote else "frame"
+            raise ValueError(f"no classic CAN {what} with an 11-bit identifier: {can_id:#x}, {len(data)} bytes")
         if self._wire is not None:
-            return self._send_raw(self._wire.out, self._wire.encode(can_id, data, remote))
+            return self._send_raw(self._wire, self._wire.encode(can_id, data, remote))
         message = self._message
         message.arbitration_id, message.dlc, message.data = can_id, len(data), bytearray(data)
         message.is_remote_frame = remote
@@ -143,41 +143,31 @@ class Bus:
             return False
         return self._accepted()
 
-    def _send_raw(self, raw: socket.socket, frame: bytes) -> bool:
+    def _send_raw(self, wire: Wire, frame: bytes) -> bool:
         try:
-            raw.send(frame, _AT_ONCE)
+            wire.send(frame, _AT_ONCE)
         except OSError as error:
-            return self._send_again(raw, frame, error)
+            return self._send_again(wire, frame, error)
         self._tries = _TRIES
         self.counts.sent += 1
         return True
 
-    def _send_again(self, raw: socket.socket, frame: bytes, error: OSError) -> bool:
+    def _send_again(self, wire: Wire, frame: bytes, error: OSError) -> bool:
         for left in reversed(range(self._tries)):
             self.error = error
             if error.errno in _FULL:
                 self._sleep(_PAUSE)
-            elif not (error.errno in _GONE and self._rebind(raw)):
+            elif not wire.mend(error.errno):
                 self.counts.failed += 1
                 return False
             if left:
                 try:
-                    raw.send(frame, _AT_ONCE)
+                    wire.send(frame, _AT_ONCE)
                 except OSError as another:
                     error = another
                 else:
                     return self._accepted()
         return self._drop()
-
-    def _rebind(self, raw: socket.socket) -> bool:
-        """A socket whose interface was removed stays without one, even if it comes back under the same name."""
-        if not isinstance(self._wire, RawCan):
-            return False
-        try:
-            raw.bind((self.url.partition(":")[2],))
-        except OSError:
-            return False
-        return True
 
     def _accepted(self) -> bool:
         self._tries = _TRIES

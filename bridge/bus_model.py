@@ -105,9 +105,9 @@ class BusModel(Protocol):
 
         Raises ValueError for a time before the last call's, and for a frame that is none."""
 
-    def hear(self, time_ns: int, frame: Frame) -> None:
-        """Takes note of a frame of a node that is not in this model, which ended by `time_ns`: the bus was taken, or will be
-        taken before frames of lower priority.
+    def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
+        """Takes note, at `time_ns`, of a frame of a node that is not in this model, which was over at `end_ns`: the bus was
+        taken then, or will be taken before frames of lower priority.
 
         Raises ValueError for a time before the last call's, and for a frame that is none."""
 

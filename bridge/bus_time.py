@@ -17,7 +17,7 @@ waits 8 bits longer after a frame of its own; over 255 (errors in sending) it is
 A node is any number; it counts errors from its first frame on.  Two nodes should not send the same identifier: if they do,
 what was sent first goes first.
 
-Frames of others, whose queues this model does not have, take the bus when it was free just before they were over; those
+Frames of others, whose queues this model does not have, took the bus before they were over if it was free; those
 that were sent meanwhile wait like all others, and take it then: so several models that hear each other share one bus.
 """
 
@@ -80,7 +80,8 @@ class _Off:
 class BusTime(BusModel):
     """A bus of `bitrate` [bit/s]; see `BusModel`.
 
-    `capacity` is how many frames a node holds, the one on the bus included.  Raises ValueError for a bit rate or a
+    `capacity` is how many frames a node holds, the one on the bus included; `note_errors` makes an event of each frame that is
+    destroyed, not only a count.  Raises ValueError for a bit rate or a
     capacity under 1, an error rate outside 0 .. 1, or a negative `restart_ns`."""
 
     def __init__(
@@ -92,6 +93,7 @@ class BusTime(BusModel):
         capacity: int = CAPACITY,
         error_rate: float = 0.0,
         restart_ns: int = 0,
+        note_errors: bool = False,
     ) -> None:
         for name, value, least in (("bit rate", bitrate, 1), ("capacity", capacity, 1), ("restart_ns", restart_ns, 0)):
             if value < least:
@@ -100,6 +102,7 @@ class BusTime(BusModel):
         self.capacity = capacity
         self.restart_ns = restart_ns
         self.events: list[BusEvent] = []
+        self._note_errors = note_errors
         self._traffic: defaultdict[int, Traffic] = defaultdict(Traffic)
         self._nodes: defaultdict[int, _Node] = defaultdict(_Node)
         self._pending: list[_Waiting] = []  # heap
@@ -166,11 +169,12 @@ class BusTime(BusModel):
         heappush(self._pending, _Waiting(frame.can_id * 2 + frame.remote, self._order, time_ns, node, frame, bits))
         return True
 
-    def hear(self, time_ns: int, frame: Frame) -> None:
+    def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
         bits = frame_bits(frame.can_id, frame.data, frame.remote)
         self._advance(time_ns)
-        began_ns = time_ns - self._span(bits - _INTERFRAME)
-        if self._free_ns <= began_ns:
+        span_ns = self._span(bits - _INTERFRAME)
+        began_ns = max(self._free_ns, min(end_ns, time_ns) - span_ns)
+        if began_ns + span_ns <= time_ns:
             self._note_start(began_ns)
             self._free_ns = began_ns + self._span(bits)
             self._busy_ns += self._free_ns - began_ns
@@ -305,7 +309,8 @@ class BusTime(BusModel):
             self._others -= 1
         elif self._destroyed:
             self._traffic[can_id].retransmitted += 1
-            self.events.append(BusEvent(end_ns, node, BusEventKind.ERROR, can_id))
+            if self._note_errors:
+                self.events.append(BusEvent(end_ns, node, BusEventKind.ERROR, can_id))
             heappush(self._pending, current)
         else:
             self._traffic[can_id].deliver(end_ns - current.queued_ns)

@@ -68,7 +68,9 @@ class ClosedStation:
         self.frames += len(frames)
 
     def stop_wheels(self, time_ns: int) -> None:
-        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends."""
+        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends.
+
+        At once, and past the models of buses that are as slow as real ones."""
         self._robots = self.role.summary()
         frames = [
             TimedFrame(time_ns, robot.robot.drive.bus, BRIDGE_NODE, frame)

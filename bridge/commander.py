@@ -54,6 +54,8 @@ class Torques:
         self._gave = False
         self.spoken = False
         """True once the robot has said something"""
+        self.torque_frames = 0
+        """So many of the last cycle's frames, the last ones, carry its torques"""
 
     def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
         """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
@@ -80,6 +82,7 @@ class Torques:
         self.spoken |= heard is not None
         self.commands += time_ns >= 0
         commands = host.command(time_ns, tau_right, tau_left, limited)
+        self.torque_frames = len(commands)
         return frames + commands if frames else commands
 
     def wheel_torques(self, time_ns: int) -> tuple[float, float]:

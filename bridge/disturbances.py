@@ -6,9 +6,8 @@ from bridge.bus_model import BusModel
 from bridge.frame_message import BRIDGE_NODE
 from bridge.protocols import drive_places
 from bridge.schedule import Schedule
+from echelon.can_plan import DISTURBANCES, NEVER_NS
 from echelon.plan import Plan
-
-KINDS = ("error_frames", "bus_off")
 
 
 class Disturbances:
@@ -17,13 +16,15 @@ class Disturbances:
 
     def __init__(self, plan: Plan, buses: Sequence[BusModel], *, bridge: bool = True, drives: bool = True) -> None:
         self._buses = buses
-        self._schedule = Schedule(event for event in plan.events if event.kind in KINDS)
+        self._schedule = Schedule(event for event in plan.events if event.kind in DISTURBANCES)
         self._rates = [0.0] * len(buses)
         self._bridge = bridge
+        self._applied_ns = -NEVER_NS
         self._places = drive_places(plan) if drives else []
 
     def apply(self, time_ns: int) -> None:
         """Makes happen what is due at an instant, which is that of the models' last call."""
+        self._applied_ns = time_ns
         active, begun = self._schedule.at(time_ns)
         for number, bus in enumerate(self._buses):
             rate = max(
@@ -37,9 +38,11 @@ class Disturbances:
                 for number in event.buses if self._bridge and not event.robots else ():
                     self._buses[number].bus_off(BRIDGE_NODE)
                 for place in self._places:
-                    if place.robot in event.robots:
+                    if place.robot in event.robots and place.bus in event.buses:
                         self._buses[place.bus].bus_off(place.node)
 
-    def next_ns(self, time_ns: int) -> int | None:
-        """Returns the next instant after `time_ns` at which something begins or ends."""
-        return self._schedule.next_ns(time_ns)
+    @property
+    def due_ns(self) -> int:
+        """When something next begins or ends."""
+        next_ns = self._schedule.next_ns(self._applied_ns)
+        return NEVER_NS if next_ns is None else next_ns

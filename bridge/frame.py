@@ -92,7 +92,9 @@ class Host(Protocol):
         """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns the protocol's own emergency stop: drives take the torque away by themselves; they stay so until `start`."""
+        """Returns the protocol's own emergency stop: drives take the torque away by themselves; they stay so until `start`.
+
+        `poll` and `command` repeat it where it seems to be lost."""
 
     def start(self) -> None:
         """Lets `poll` enable the drives (again), whatever was wrong until then.  A new host is started."""

@@ -46,7 +46,7 @@ class IdealBus(BusModel):
         self._delivered.append(Delivered(time_ns, time_ns, node, frame))
         return True
 
-    def hear(self, time_ns: int, frame: Frame) -> None:
+    def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
         self._advance(time_ns)
 
     def run(self, until_ns: int) -> list[Delivered]:

@@ -8,32 +8,49 @@ frames go out at once: a real bus takes its own time.
 """
 
 from bridge.bus import Bus
-from bridge.bus_model import BusModel, Delivered
+from bridge.bus_model import BusEventKind, BusModel, Delivered
 from bridge.frame import Frame
 
 
 class PacedBus:
-    """A bus and its model.  Times are run time, and never run backwards."""
+    """A bus and its model.  Times are run time, and never run backwards.
 
-    def __init__(self, bus: Bus, model: BusModel) -> None:
+    After a standstill, frames that were over for more than `old_ns` are not sent any more."""
+
+    def __init__(self, bus: Bus, model: BusModel, old_ns: int) -> None:
         self.bus, self.model = bus, model
+        self.expired = 0
+        """Frames that were too old"""
+        self._old_ns = old_ns
+        self._seen = 0
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
         """Puts a frame into the queue of a node of this process; False: it is lost, and counted in the model."""
         queued = self.model.send(time_ns, node, frame)
         if self.model.is_off(node):
-            # A controller that is off takes nothing: what came when it is back would be old.
-            self.model.clear(node)
+            self.model.clear(node)  # as all that waited when it went off: it would be old when it is back
             return False
         return queued
 
-    def hear(self, time_ns: int, frame: Frame) -> None:
-        """Takes note of a frame that came from the bus."""
-        self.model.hear(time_ns, frame)
+    def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
+        """Takes note of a frame that came from the bus, where it was over at `end_ns`."""
+        self.model.hear(time_ns, frame, end_ns)
 
     def run(self, time_ns: int) -> list[Delivered]:
         """Sends what is over by now; returns what the bus took."""
-        return [sent for sent in self.model.run(time_ns) if self.bus.send(*sent.frame[:2], remote=sent.frame.remote)]
+        taken = []
+        for sent in self.model.run(time_ns):
+            can_id, data, remote = sent.frame
+            if time_ns - sent.end_ns > self._old_ns:
+                self.expired += 1
+            elif self.bus.send(can_id, data, remote=remote):
+                taken.append(sent)
+        events = self.model.events
+        while self._seen < len(events):
+            if events[self._seen].kind is BusEventKind.OFF:
+                self.model.clear(events[self._seen].node)
+            self._seen += 1
+        return taken
 
     @property
     def due_ns(self) -> int | None:

@@ -1,8 +1,10 @@
 """What frames look like on sockets: the kernel's raw CAN frames, and python-can's multicast datagrams."""
 
+import errno
 import os
 import socket
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import can
@@ -13,6 +15,7 @@ _REMOTE = 0x40000000  # CAN_RTR_FLAG
 _OTHER = 0xA0000000  # CAN_EFF_FLAG, CAN_ERR_FLAG: frames with 29-bit identifiers, and news of the controller
 _DATAGRAM = 4096  # bytes; one with a frame has some 160
 _BUFFER = 4 << 20
+_GONE = (errno.ENXIO, errno.ENODEV)
 
 
 class RawCan:
@@ -20,8 +23,22 @@ class RawCan:
 
     size = _FRAME.size
 
-    def __init__(self, raw: socket.socket) -> None:
+    def __init__(self, raw: socket.socket, interface: str) -> None:
         self.into = self.out = raw
+        self.send = raw.send
+        self._interface = interface
+
+    def mend(self, number: int | None) -> bool:
+        """After an error while sending: true if it may work now.
+
+        A socket whose interface was removed stays without one, even if it comes back under the same name."""
+        if number not in _GONE:
+            return False
+        try:
+            self.out.bind((self._interface,))
+        except OSError:
+            return False
+        return True
 
     @staticmethod
     def encode(can_id: int, data: bytes, remote: bool) -> bytes:
@@ -43,7 +60,7 @@ class RawCan:
 class Datagrams:
     """Frames as python-can's multicast buses have them.
 
-    They are sent from a socket of our own: by its address what comes back to us is known."""
+    They are sent from a socket of our own: by its port, which nobody else on this host has, what comes back is known."""
 
     size = _DATAGRAM
 
@@ -56,12 +73,29 @@ class Datagrams:
                 self.out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             else:
                 self.out.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, 0)
-            self.out.connect((group, port))
+            self.out.bind(("", 0))
         except OSError:
             self.close()
             raise
-        self._own = self.out.getsockname()[:2]
+        self._port = self.out.getsockname()[1]
+        self._target = group, port
+        self.send: Callable[[bytes, int], int] = self._send_to
+        self.mend(None)
         self._parts: dict[tuple[int, int, bool], tuple[bytes, bytes]] = {}
+
+    def _send_to(self, payload: bytes, flags: int) -> int:
+        return self.out.sendto(payload, flags, self._target)
+
+    def mend(self, number: int | None) -> bool:
+        """After an error while sending: false, for this frame is lost; but with the next the host's addresses may be others.
+
+        A socket that is connected saves the way to be looked up for each frame; some groups can do without only."""
+        try:
+            self.out.connect(self._target)
+            self.send = self.out.send
+        except OSError:
+            self.send = self._send_to
+        return False
 
     def encode(self, can_id: int, data: bytes, remote: bool) -> bytes:
         key = can_id, len(data), remote
@@ -74,13 +108,15 @@ class Datagrams:
         """Returns identifier, data, and whether it is a remote frame; None for what is not for us.
 
         Raises whatever python-can makes of a datagram that is none of its own."""
-        if address[:2] == self._own:
+        if address[1] == self._port:
             return None
         message = unpack_message(payload, check=True)
         if message.is_error_frame or message.is_fd or message.is_extended_id:
             return None
-        remote = message.is_remote_frame
-        return message.arbitration_id, b"" if remote else bytes(message.data), remote
+        can_id, remote = message.arbitration_id, message.is_remote_frame
+        if type(can_id) is not int or type(remote) is not bool:  # python-can takes 5.0 for a 5
+            raise TypeError(f"no identifier, or not known whether remote: {can_id!r}, {remote!r}")
+        return can_id, b"" if remote else bytes(message.data), remote
 
     def close(self) -> None:
         self.into.close()

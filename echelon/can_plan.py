@@ -1,6 +1,7 @@
 """The part of a plan that concerns the CAN bus: motors, drives, envelopes, buses, events, and who is in between."""
 
 from dataclasses import dataclass
+from typing import Final
 
 NEVER_NS = 1 << 62
 """Later than any instant of a run."""
@@ -111,6 +112,10 @@ class CanPlan:
     def closed(self) -> bool:
         """True if the plant takes its torque from the drives."""
         return self.path == "closed"
+
+
+DISTURBANCES: Final = ("error_frames", "bus_off")
+"""Kinds of events that buses suffer."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.can_plan import NEVER_NS, CanPlan, DrivePlan, EnvelopePlan, EventPlan, StationPlan
+from echelon.can_plan import DISTURBANCES, NEVER_NS, CanPlan, DrivePlan, EnvelopePlan, EventPlan, StationPlan
 from echelon.messages import Channel
 
 Array = NDArray[np.float64]
@@ -224,4 +224,7 @@ class Plan:
 
 def on_wall_clock(plan: Plan) -> Plan:
     """Returns the plan as those have it who are on a bus on a wall clock: the bus takes its own time unless it is paced."""
-    return plan if plan.can.paced else replace(plan, can=replace(plan.can, timing="ideal"))
+    if plan.can.paced:
+        return plan
+    events = tuple(event for event in plan.events if event.kind not in DISTURBANCES)
+    return replace(plan, can=replace(plan.can, timing="ideal"), events=events)

@@ -1,6 +1,10 @@
 """Where the buses of a run are: what the scenario says, what --can says, and what this machine has."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 from bridge.bus_url import interface_is_up, resolve_url
+from echelon.can_plan import DISTURBANCES
 from echelon.plan import Plan
 from sim.usage import UsageError
 
@@ -23,6 +27,19 @@ def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ..
     if len(set(resolved)) < len(resolved):
         raise UsageError(f"--can {wanted or ','.join(urls)}: {len(resolved)} buses need as many places")
     return resolved
+
+
+def check_wall_clock(plan: Plan, urls: Sequence[str]) -> None:
+    """Raises UsageError for what cannot be on a wall clock, with the buses at these places."""
+    disturbed = sorted({event.kind for event in plan.events} & set(DISTURBANCES))
+    if disturbed and not plan.can.paced:
+        raise UsageError(
+            f"events of kind {disturbed[0]!r}: on a wall clock a bus takes its own time, and errors as they come"
+            + ("; can.timing = 'bits' makes a virtual one as slow as a real one" if plan.can.virtual_drives else "")
+        )
+    real = [url for url in urls if (Path("/sys/class/net") / url.partition(":")[2] / "device").exists()]
+    if plan.can.paced and real:
+        raise UsageError(f"can.timing = 'bits': {real[0]} is a real bus on a wall clock, and takes its own time")
 
 
 def _checked_bus(url: str, number: int = 0) -> str:

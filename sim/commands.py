@@ -110,7 +110,7 @@ def dbc(arguments: argparse.Namespace) -> int:
 
 def drives(arguments: argparse.Namespace) -> int:
     """`echelon drives`"""
-    from sim.bus_urls import bus_urls
+    from sim.bus_urls import bus_urls, check_wall_clock
     from sim.drives_command import run_drives
 
     arguments.set = [*(arguments.set or ()), "can.path=closed", "can.virtual_drives=true"]
@@ -118,6 +118,7 @@ def drives(arguments: argparse.Namespace) -> int:
     urls = bus_urls(plan, arguments.can, False)
     if not urls or any(url.startswith("virtual") for url in urls):
         raise UsageError("drives without a bus to others: give --can socketcan:vcan0, udp_multicast: or auto")
+    check_wall_clock(plan, urls)
     try:
         run_drives(plan, urls, arguments.seconds, lambda line: print(line, flush=True))
     except (ValueError, OSError) as error:

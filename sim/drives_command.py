@@ -63,18 +63,22 @@ def run_drives(plan: Plan, urls: Sequence[str], seconds: float | None, say: Call
                 now_s = (time.monotonic_ns() - start_ns) / 1e9
                 if now_s >= said_s + LINE_S:
                     said_s = now_s
-                    say(line_of(plan, drives.bank, buses, now_s))
+                    say(line_of(plan, drives, buses, now_s))
         except KeyboardInterrupt:
             say("")
-        say(line_of(plan, drives.bank, buses, now_s))
+        say(line_of(plan, drives, buses, now_s))
 
 
-def line_of(plan: Plan, bank: DriveBank, buses: Sequence[Bus], now_s: float) -> str:
+def line_of(plan: Plan, drives: WallDrives, buses: Sequence[Bus], now_s: float) -> str:
     """Returns how things stand in one line: frames, wheels that turn or have torque, what was refused."""
+    bank = drives.bank
     received, sent = (sum(getattr(bus.counts, what) for bus in buses) for what in ("received", "sent"))
     parts = [f"{now_s:6.1f} s", f"{received} frames in, {sent} out"]
     if failed := sum(bus.counts.failed + bus.counts.dropped for bus in buses):
         parts.append(f"{failed} not sent")
+    for what, number in zip(("lost", "destroyed"), drives.lost_and_destroyed(), strict=True):
+        if number:
+            parts.append(f"{number} {what} on the bus")
     wheels = _wheels(plan, bank)
     parts += wheels[:SHOWN]
     if len(wheels) > SHOWN:

@@ -17,7 +17,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         warm_up()
     scenario, plan = scenario_of(arguments)
-    from sim.bus_urls import bus_urls
+    from sim.bus_urls import bus_urls, check_wall_clock
     from sim.live import Display
     from sim.run import execute, new_folder
     from sim.summary import summary_text
@@ -25,12 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     can_urls = bus_urls(plan, arguments.can, arguments.engine == "inprocess")
     if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
         raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
-    kinds = {event.kind for event in plan.events} & {"error_frames", "bus_off"}
-    if arguments.clock == "wall" and kinds and not plan.can.paced:
-        raise UsageError(
-            f"events of kind {min(kinds)!r}: with --clock wall the bus takes its own time, and errors, as they come; "
-            "can.timing = 'bits' makes a virtual one as slow as a real one, with errors on schedule"
-        )
+    if arguments.clock == "wall":
+        check_wall_clock(plan, can_urls)
     if plan.can.closed and arguments.engine == "processes" and any(url.startswith("virtual") for url in can_urls):
         raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
     if arguments.clock == "virtual" and not plan.can.virtual_drives:

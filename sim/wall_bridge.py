@@ -47,7 +47,10 @@ class WallBridge:
         )
         self.mail = Mail(plan)
         self._role = self.station.role
-        self._buses = [PacedBus(bus, model) for bus, model in zip(self.station.buses, self._role.buses, strict=True)]
+        self._buses = [
+            PacedBus(bus, model, plan.can.watchdog_ns)
+            for bus, model in zip(self.station.buses, self._role.buses, strict=True)
+        ]
         self._period_ns = plan.stations[0].period_ns
         self._last: list[Message | None] = [None] * len(plan.robots)
         self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period that a robot's torque was last sent in
@@ -124,10 +127,10 @@ class WallBridge:
         for number, bus in enumerate(self.station.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
-                self._buses[number].hear(now_ns, frame)
+                came_ns = min(received.time_ns - self.epoch_ns, now_ns)  # as the kernel saw it
+                self._buses[number].hear(now_ns, frame, came_ns)
                 if not self._role.buses[number].is_off(BRIDGE_NODE):
                     self._role.receive(now_ns, number, frame)
-                came_ns = min(received.time_ns - self.epoch_ns, now_ns)  # as the kernel saw it
                 self._note(TimedFrame(came_ns, number, OTHER_NODE, frame))
 
     def pass_time(self, now_ns: int) -> None:
@@ -160,14 +163,15 @@ class WallBridge:
     def carry(self, now_ns: int) -> None:
         """Lets buses take what they can have taken by now."""
         for number, bus in enumerate(self._buses):
-            for queued_ns, end_ns, _, frame in bus.run(now_ns):
+            for queued_ns, _, _, frame in bus.run(now_ns):
                 self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
-                awaited = self._awaited.get((number, frame.can_id), ())
-                while awaited and awaited[0][0] <= queued_ns:
-                    at_ns, state_ns = awaited.popleft()
-                    if at_ns == queued_ns:  # others were lost on the way
-                        self.latencies.append(end_ns - state_ns)
-                        self.in_time += end_ns - state_ns < self._period_ns
+                awaited = self._awaited.get((number, frame.can_id))
+                while awaited and awaited[0][0] < queued_ns:
+                    awaited.popleft()  # lost on the way
+                if awaited and awaited[0][0] == queued_ns:
+                    latency_ns = now_ns - awaited.popleft()[1]
+                    self.latencies.append(latency_ns)
+                    self.in_time += latency_ns < self._period_ns
 
     def stop(self, now_ns: int) -> None:
         """Takes the torque away from all wheels and disables their drives."""
@@ -177,8 +181,9 @@ class WallBridge:
     def result(self) -> dict[str, Any]:
         """Returns what there is to say of the bridge; latencies [s] are from a robot's state to its torque frames."""
         result = self.station.result()
-        for row, load in zip(result["buses"], self._loads(), strict=True):
+        for row, load, paced in zip(result["buses"], self._loads(), self._buses, strict=True):
             row["load"] = load
+            row["lost"] += paced.expired
             if not self.plan.can.paced:
                 row["identifiers"] = {}  # how long its frames take the bus alone knows
         result["load_mean"] = max(row["load"] for row in result["buses"])
@@ -213,11 +218,12 @@ class WallBridge:
         torques = self._role.robots[robot]
         self._sent_in[robot] = cycle
         bus = torques.robot.drive.bus
-        for frame in torques.frames(now_ns, self._last[robot]):
-            queued = self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
-        if queued and state_ns is not None:
+        frames = torques.frames(now_ns, self._last[robot])
+        queued = [self._buses[bus].send(now_ns, BRIDGE_NODE, frame) for frame in frames]
+        if state_ns is not None and torques.torque_frames and queued[-1]:
             # What was wanted is on the bus with the last of its frames.
-            self._awaited.setdefault((bus, frame.can_id), deque()).append((now_ns, state_ns))
+            key = bus, frames[-1].can_id
+            self._awaited.setdefault(key, deque(maxlen=self.plan.can.queue)).append((now_ns, state_ns))
         self.carry(now_ns)
 
     def _note(self, timed: TimedFrame) -> None:

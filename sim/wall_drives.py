@@ -83,22 +83,26 @@ class WallDrives:
         self.plan = on_wall_clock(plan)
         self.bank = DriveBank(self.plan)
         models = make_buses(self.plan, part=1)
-        self._buses = [PacedBus(bus, model) for bus, model in zip(buses, models, strict=True)]
+        self._buses = [
+            PacedBus(bus, model, self.plan.can.watchdog_ns) for bus, model in zip(buses, models, strict=True)
+        ]
         self._disturbances = Disturbances(self.plan, models, bridge=False)
 
     @property
     def due_ns(self) -> int:
         """When there is something to do without anything having come."""
-        return min([self.bank.due_ns, *(due_ns for bus in self._buses if (due_ns := bus.due_ns) is not None)])
+        due_ns = min(self.bank.due_ns, self._disturbances.due_ns)
+        return min([due_ns, *(end_ns for bus in self._buses if (end_ns := bus.due_ns) is not None)])
 
     def serve(self, start_ns: int, also: Sequence[Any] = ()) -> None:
         """Waits for what comes next, a frame or an instant of their own, and lets the drives work; `also` ends the wait too."""
         wait_for([*also, *(paced.bus for paced in self._buses)], self.due_ns - (time.monotonic_ns() - start_ns))
+        epoch_ns = epoch_ns_of(start_ns)
         for number, paced in enumerate(self._buses):
             for received in drained(paced.bus):
                 now_ns = time.monotonic_ns() - start_ns
                 frame = Frame(received.can_id, received.data, received.remote)
-                paced.hear(now_ns, frame)
+                paced.hear(now_ns, frame, received.time_ns - epoch_ns)
                 self._send(self.bank.receive(now_ns, number, frame))
         now_ns = time.monotonic_ns() - start_ns
         self._send(self.bank.pass_time(now_ns))
@@ -123,4 +127,11 @@ class WallDrives:
                 bus_row(self.plan, number, paced.model, fit[number].responses_ns)
                 for number, paced in enumerate(self._buses)
             ]
+            for row, paced in zip(result["buses"], self._buses, strict=True):
+                row["lost"] += paced.expired
         return result
+
+    def lost_and_destroyed(self) -> tuple[int, int]:
+        """Returns how many frames a paced bus lost, and how many it destroyed, which were sent again."""
+        rows = [row for paced in self._buses for row in paced.model.traffic.values()]
+        return sum(row.lost for row in rows), sum(row.retransmitted for row in rows)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
+import msgpack
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -119,6 +120,13 @@ def test_frames_arrive_whole_and_in_order(kind: str) -> None:
         assert (receiver.counts.received, receiver.counts.recv_failed, sender.counts.received) == (len(FRAMES), 0, 0)
 
 
+ODD = [
+    msgpack.packb({"arbitration_id": can_id, "is_extended_id": False, "is_remote_frame": remote, "data": b"", "dlc": 0})
+    for can_id, remote in [(5.0, False), (float("nan"), False), (True, False), (5, "x"), (5, [1]), (5, 2)]
+]
+"""Datagrams that python-can takes for frames"""
+
+
 @pytest.fixture
 def multicast() -> Iterator[tuple[Bus, can.BusABC]]:
     """A bus of ours, and python-can's own on the same group and port."""
@@ -150,6 +158,32 @@ def test_python_can_takes_our_datagrams_and_we_take_its(
     assert plain.recv(5.0) is not None  # python-can does hear itself
 
 
+def test_when_the_way_to_the_group_changes_the_next_frame_takes_the_new_one(
+    multicast: tuple[Bus, can.BusABC],
+) -> None:
+    bus, plain = multicast
+
+    def gone(payload: bytes, flags: int) -> int:
+        raise OSError(errno.ENETUNREACH, "no route")
+
+    assert bus._wire is not None
+    bus._wire.send = gone
+    assert [bus.send(number, b"") for number in range(3)] == [False, True, True]
+    assert (bus.counts.failed, bus.counts.sent) == (1, 2)
+    assert [(plain.recv(5.0) or can.Message()).arbitration_id for _ in range(2)] == [1, 2]
+    assert bus.recv() is None
+
+
+@pytest.mark.parametrize("group", ["ff02::e1", "ff15::e1"])
+def test_groups_of_every_scope(group: str) -> None:
+    port = own_url("udp_multicast").rpartition(":")[2]
+    with open_or_skip(f"udp_multicast:[{group}]:{port}") as bus, open_bus(bus.url) as other:
+        if not bus.send(1, b"x"):
+            pytest.skip(f"no way to {group} here: {bus.error}")
+        assert (other.recv(5.0) or (0,))[:2] == (1, b"x")
+        assert bus.recv() is None
+
+
 def test_what_is_no_frame_for_us_is_counted_or_passed_over(multicast: tuple[Bus, can.BusABC]) -> None:
     bus, plain = multicast
     for other in ({"is_extended_id": True}, {"is_error_frame": True, "is_extended_id": False}):
@@ -157,16 +191,16 @@ def test_what_is_no_frame_for_us_is_counted_or_passed_over(multicast: tuple[Bus,
     group, _, port = bus.url.partition(":")[2].rpartition(":")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-        for junk in (b"", b"junk", bytes(3000), b"\x80", b"\x81\xaearbitration_id\xa3abc"):
+        for junk in (b"", b"junk", bytes(3000), b"\x80", b"\x81\xaearbitration_id\xa3abc", *ODD):
             stranger.sendto(junk, (group, int(port)))
     plain.send(can.Message(arbitration_id=7, is_extended_id=False))
     got = []
     while not got or got[-1] is None:
         got.append(bus.recv(5.0))
-        assert len(got) < 20
+        assert len(got) < 30
     assert got[-1] is not None
     assert got[-1].can_id == 7
-    assert bus.counts.recv_failed == len(got) - 1 >= 4
+    assert bus.counts.recv_failed == len(got) - 1 >= 4 + len(ODD)
     assert bus.counts.received == 1
 
 
@@ -184,6 +218,11 @@ def test_a_bus_nobody_reads_drops_without_blocking() -> None:
     with open_bus(own_url("virtual")) as sender, open_bus(sender.url):
         sent = [sender.send(1, b"") for _ in range((1 << 16) + 10)]
         assert (sum(sent), sender.counts.failed + sender.counts.dropped) == (1 << 16, 10)
+
+
+def test_a_remote_frame_has_no_data() -> None:
+    with open_bus(own_url("virtual")) as bus, pytest.raises(ValueError, match="remote frame"):
+        bus.send(1, b"x", remote=True)
 
 
 @pytest.mark.parametrize(("can_id", "data"), [(0x800, b""), (-1, b""), (1, bytes(9))])
@@ -216,7 +255,7 @@ class Socket:
 def raw_bus(answers: list[int], bind: int = 0) -> tuple[Bus, Socket, list[float]]:
     raw, pauses = Socket(answers, bind), list[float]()
     plain = can.Bus(interface="virtual", channel=str(uuid.uuid4()))
-    bus = Bus(plain, "socketcan:vcan0", RawCan(raw), pauses.append)  # type: ignore[arg-type]
+    bus = Bus(plain, "socketcan:vcan0", RawCan(raw, "vcan0"), pauses.append)  # type: ignore[arg-type]
     return bus, raw, pauses
 
 
@@ -239,7 +278,7 @@ def test_receiving_on_a_raw_socket() -> None:
     bus, _, _ = raw_bus([])
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ours, theirs:
-        bus._wire = RawCan(ours)
+        bus._wire = RawCan(ours, "vcan0")
         assert bus.recv(0.0) is None
         for can_id in (0x80000123, 0x20000004, 0x40000105, 0x7FF):  # extended, error, remote, plain
             theirs.send(kernel_frame(can_id, b"0123"))
@@ -260,7 +299,7 @@ def test_waiting_on_a_raw_socket_ends_with_a_frame_or_with_the_time() -> None:
     bus, _, _ = raw_bus([])
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ours, theirs:
-        bus._wire = RawCan(ours)
+        bus._wire = RawCan(ours, "vcan0")
         begun_s = time.monotonic()
         assert bus.recv(0.05) is None
         assert time.monotonic() - begun_s >= 0.05
@@ -281,7 +320,7 @@ def test_trouble_while_receiving_on_a_raw_socket_is_counted() -> None:
     bus, _, _ = raw_bus([])
     closed = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     closed.close()
-    bus._wire = RawCan(closed)
+    bus._wire = RawCan(closed, "vcan0")
     assert bus.recv(None) is None
     assert bus.counts.recv_failed == 1
     assert isinstance(bus.error, OSError)

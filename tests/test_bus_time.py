@@ -191,7 +191,7 @@ Script = list[tuple[int, tuple[int, Frame] | int | float | None]]  # gap; send, 
 
 def compare(script: Script, capacity: int, restart_bits: int, rest_bits: int) -> SlowBus:
     """Plays a script on both buses; everything must agree."""
-    fast = BusTime(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT)
+    fast = BusTime(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT, note_errors=True)
     slow = SlowBus(7, 2, capacity, restart_bits)
     delivered: list[Delivered] = fast.run(0)
     for gap, action in [*script, (rest_bits, None)]:
@@ -389,7 +389,7 @@ def test_a_bus_that_is_only_waiting_for_a_node_to_come_back_is_due_by_then() -> 
 
 def test_errors_are_a_function_of_seed_bus_and_attempt() -> None:
     def errors(seed: int, number: int) -> list[int]:
-        bus = BusTime(MEGA, seed, number, error_rate=0.2)
+        bus = BusTime(MEGA, seed, number, error_rate=0.2, note_errors=True)
         for n in range(900):
             bus.send(n * 1_000_000, 1, Frame(n))
         bus.run(10**12)
@@ -432,7 +432,7 @@ def test_a_receiver_counts_errors_of_others(errors: int, after: int) -> None:
 def test_an_error_costs_between_17_and_23_bits_besides_what_was_sent() -> None:
     costs = set()
     for seed in range(200):
-        bus = BusTime(MEGA, seed, error_rate=1.0)
+        bus = BusTime(MEGA, seed, error_rate=1.0, note_errors=True)
         bus.send(0, 1, A)
         due_ns = bus.due_ns
         assert due_ns == 1

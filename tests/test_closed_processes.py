@@ -216,9 +216,28 @@ def test_on_a_wall_clock_errors_come_on_schedule_and_a_controller_that_is_off_co
     assert can["referee"]["kinds"]  # it saw that something was missing
 
 
-def test_on_a_wall_clock_a_bus_that_takes_its_own_time_takes_no_orders(tmp_path: Path) -> None:
-    event = 'events=[{kind="bus_off", at=1}]'
-    arguments = ["run", "lab", "--clock", "wall", "--set", "can.path=closed", "--set", event, "--out", tmp_path]
-    done = echelon(*arguments)
+@pytest.mark.parametrize("protocol", ["native", "odrive", "cia402"])
+def test_where_no_drive_answers_the_bridge_says_so_and_goes_on(tmp_path: Path, protocol: str) -> None:
+    sets = [
+        "can.path=closed",
+        "can.virtual_drives=false",
+        f"robot.drive.protocol={protocol}",
+        "duration=0.5",
+        "claims=[]",
+    ]
+    arguments = [word for value in sets for word in ("--set", value)]
+    done = echelon("run", "lab", "--clock", "wall", "--quiet", "--no-report", "--out", tmp_path / "run", *arguments)
+    assert done.returncode == 1
+    assert "lost bridge" not in done.stdout + done.stderr
+    robots = summary_of(tmp_path / "run")["can"]["robots"]
+    assert not any(row["enabled"] for row in robots.values())
+
+
+@pytest.mark.parametrize("command", ["run", "drives"])
+@pytest.mark.parametrize("event", ['kind="error_frames", rate=0.1', 'kind="bus_off", robot="g1/r1"'])
+def test_disturbances_need_a_bus_that_is_a_model(command: str, event: str) -> None:
+    clock = ["--clock", "wall"] if command == "run" else ["--seconds", "1"]
+    events = f"events=[{{{event}, at=0.1}}]"
+    done = echelon(command, "lab", *clock, "--set", "can.path=closed", "--set", events)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("echelon: events of kind 'bus_off': with --clock wall the bus takes its own time")
+    assert "takes its own time" in done.stderr

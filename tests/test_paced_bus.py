@@ -16,6 +16,7 @@ from bridge.paced_bus import PacedBus
 
 BIT = 2_000  # ns at 500 kbit/s
 LONGEST = worst_case_bits(8) * BIT
+OLD = 100_000_000
 
 
 class Port:
@@ -31,7 +32,7 @@ class Port:
 
 
 def paced(**options: Any) -> PacedBus:
-    return PacedBus(Port(), BusTime(500_000, **options))  # type: ignore[arg-type]
+    return PacedBus(Port(), BusTime(500_000, **options), OLD)  # type: ignore[arg-type]
 
 
 def bits(frame: Frame) -> int:
@@ -51,7 +52,7 @@ def play(
         now = min(times)
         while heard and heard[0][0] <= now:
             at, number, frame = heard.pop(0)
-            models[number].hear(at, frame)
+            models[number].hear(now, frame, at - late_ns)
         while todo and todo[0][0] <= now:
             at, number, frame = todo.pop(0)
             assert models[number].send(at, 0, frame)
@@ -96,7 +97,7 @@ def test_alone_it_is_the_model_that_it_has() -> None:
 def test_an_idle_bus_was_taken_before_a_frame_was_heard() -> None:
     """So what is sent next waits for three bits, and not for all of it once more."""
     one, theirs, mine = paced(), Frame(0x200, bytes(8)), Frame(0x300, b"\x01")
-    one.hear(1_000_000, theirs)
+    one.hear(1_000_000, theirs, 1_000_000)
     one.send(1_000_000, 0, mine)
     assert play([], [one], 0) == [(1_000_000 + 3 * BIT + (bits(mine) - 3) * BIT, 0, mine)]
     assert one.model.busy_ns == (bits(theirs) + bits(mine) - 3) * BIT
@@ -118,7 +119,7 @@ def test_the_lower_identifier_goes_first() -> None:
 def test_a_flood_from_others_is_forgotten_beyond_a_queue_full() -> None:
     one = paced(capacity=10)
     for _ in range(1000):
-        one.hear(0, Frame(0x001))
+        one.hear(0, Frame(0x001), 0)
     assert one.send(0, 0, Frame(0x500))
     (out,) = play([], [one], 0)
     assert out[0] <= 12 * LONGEST
@@ -142,7 +143,7 @@ def test_a_controller_that_is_off_takes_nothing_and_comes_back_while_others_talk
     back_ns = None
     for at in range(1, 3000):  # between any two frames there are 20 recessive bits and more: one run of 11 each
         now = at * LONGEST
-        one.hear(now, Frame(0x200, bytes(2)))
+        one.hear(now, Frame(0x200, bytes(2)), now)
         one.run(now)
         if not one.model.is_off(0):
             back_ns = now
@@ -155,6 +156,37 @@ def test_a_controller_that_is_off_takes_nothing_and_comes_back_while_others_talk
     assert len(play([], [one], 0)) == 1
 
 
+def test_what_waited_when_a_controller_went_off_is_lost() -> None:
+    """It would be old when it is back, also if nothing is sent meanwhile."""
+    one = paced(restart_ns=OLD)
+    for _ in range(5):
+        one.send(0, 0, Frame(0x100))
+    one.run(10)
+    one.model.bus_off(0)
+    assert len(play([], [one], 0)) == 1  # the one on the bus
+    one.run(2 * OLD)
+    assert not one.model.is_off(0)
+    assert one.model.traffic[0x100].lost == 4
+
+
+def test_frames_heard_in_a_bunch_took_the_bus_when_they_were_sent() -> None:
+    one, theirs, mine = paced(), Frame(0x200, bytes(8)), Frame(0x300, b"\x01")
+    for at in range(1, 11):
+        one.hear(3_000_000, theirs, at * LONGEST)
+    one.send(3_000_000, 0, mine)
+    assert play([], [one], 0) == [(3_000_000 + (bits(mine) - 3) * BIT, 0, mine)]
+    assert one.model.busy_ns == (10 * bits(theirs) + bits(mine) - 3) * BIT
+
+
+def test_after_a_standstill_what_is_old_is_not_sent() -> None:
+    one = paced()
+    for _ in range(3):
+        one.send(0, 0, Frame(0x100))
+    one.send(2 * OLD, 0, Frame(0x101))
+    assert [sent.frame.can_id for sent in one.run(2 * OLD + LONGEST)] == [0x101]
+    assert one.expired == 3
+
+
 def test_good_frames_of_others_take_errors_back() -> None:
     one = paced(error_rate=1.0)
     one.send(0, 0, Frame(0x100))
@@ -165,19 +197,19 @@ def test_good_frames_of_others_take_errors_back() -> None:
     assert before > 1
     play([], [one], 0)
     after = one.model.counters(1)[1]
-    one.hear(100 * LONGEST, Frame(0x300))
+    one.hear(100 * LONGEST, Frame(0x300), 100 * LONGEST)
     assert one.model.counters(1)[1] == after - 1
 
 
 def test_what_the_bus_did_not_take_was_not_sent() -> None:
-    one = PacedBus(Port(takes=False), BusTime(500_000))  # type: ignore[arg-type]
+    one = PacedBus(Port(takes=False), BusTime(500_000), OLD)  # type: ignore[arg-type]
     one.send(0, 0, Frame(0x100))
     assert one.run(LONGEST) == []
 
 
 def test_an_ideal_bus_takes_frames_at_once() -> None:
-    one = PacedBus(Port(), IdealBus())  # type: ignore[arg-type]
-    one.hear(5, Frame(0x200))
+    one = PacedBus(Port(), IdealBus(), OLD)  # type: ignore[arg-type]
+    one.hear(5, Frame(0x200), 5)
     one.send(5, 3, Frame(0x100))
     assert one.due_ns == 5
     assert [sent.node for sent in one.run(5)] == [3]

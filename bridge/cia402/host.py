@@ -117,7 +117,7 @@ class Cia402Host:
         return self._halt(time_ns, Command.DISABLE_VOLTAGE)
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns frames that make the drives stop quickly; `poll` then disables them, and they stay so until `start`."""
+        """Returns frames that make the drives stop quickly, as they are configured to; they stay so until `start`."""
         return self._halt(time_ns, Command.QUICK_STOP)
 
     def _halt(self, time_ns: int, command: Command) -> list[Frame]:

@@ -164,6 +164,11 @@ class Wheel:
             if self._late(time_ns, self.started_ns):
                 self.nmt = None
             return []
+        stopping = not started and self.controlword == Command.QUICK_STOP.value
+        if stopping and self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+            # The drive stops as it is configured to; only a controlword that was lost is sent again.
+            lost = self.state is State.OPERATION_ENABLED and self._late(time_ns, self.controlled_ns)
+            return [self.control(time_ns, Command.QUICK_STOP)] if lost else []
         command = _UP.get(self.state) if started else Command.DISABLE_VOLTAGE
         if command is Command.ENABLE_OPERATION and self.mode != MODE_CYCLIC_TORQUE:
             command = Command.SWITCH_ON

@@ -63,6 +63,7 @@ class NativeHost:
         self._clearing_ns: int | None = None  # since when commands clear
         self._status_counter = CounterCheck()
         self._started = True
+        self._estopped = False
         self._starts = False  # `start` was called, and `poll` not yet
         self._old_until_ns = -NEVER_NS  # faults noticed by then are from before a start
         self._sent = 0
@@ -100,7 +101,8 @@ class NativeHost:
         if not abs(tau_right) + abs(tau_left) < float("inf"):
             raise ValueError(f"torques must be finite, not {tau_right!r} and {tau_left!r}")
         ready = self._started and not self._fault
-        return self._send(0.0, 0.0, saturated, enable=ready, clear=self._clearing_ns is not None)
+        clear = self._clearing_ns is not None
+        return self._send(0.0, 0.0, saturated, enable=ready, clear=clear, estop=self._estopped)
 
     def stop(self, time_ns: int) -> list[Frame]:
         """Returns the command that disables both wheels; they stay so until `start`."""
@@ -110,8 +112,8 @@ class NativeHost:
         return self._send(0.0, 0.0, enable=False)
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns the command that makes both wheels fault at once."""
-        self._started = False
+        """Returns the command that makes both wheels fault at once; those of all cycles until `start` do, too."""
+        self._started, self._estopped = False, True
         self._states = _DISABLED
         self._clearing_ns = None
         return self._send(0.0, 0.0, enable=False, estop=True)
@@ -119,6 +121,7 @@ class NativeHost:
     def start(self) -> None:
         """Lets the wheels be enabled (again), whatever was wrong until then."""
         self._started = self._starts = True
+        self._estopped = False
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes feedback or status."""

@@ -83,6 +83,8 @@ class ODriveHost:
         self._identifiers = frozenset(self._by_id)
         self._torque_ids = tuple(frame_id(axis.node, Command.SET_INPUT_TORQUE) for axis in self._axes)
         self._started = True
+        self._halts = Command.SET_AXIS_STATE
+        """What halts an axis that is not started: `Set_Axis_State` with IDLE, or `Estop`"""
         self._zero_first = True
 
     @property
@@ -125,8 +127,8 @@ class ODriveHost:
             if axis.closed or (axis.asked_ns is not None and time_ns - axis.asked_ns < RETRY_NS):
                 continue
             if not self._started:
-                if axis.state == AxisState.CLOSED_LOOP_CONTROL:  # the frame of `stop` was lost
-                    frames.append(axis.send(Command.SET_AXIS_STATE, AxisState.IDLE))
+                if axis.state == AxisState.CLOSED_LOOP_CONTROL:  # the frame of `stop` or `estop` was lost
+                    frames.append(self._halt_frame(axis))
                     axis.asked_ns = time_ns
             elif axis.fresh or not axis.fault or self._may_recover(axis, time_ns):
                 frames += axis.bring_up()
@@ -156,14 +158,14 @@ class ODriveHost:
 
     def stop(self, time_ns: int) -> list[Frame]:
         """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
-        self._halt()
+        self._halt(Command.SET_AXIS_STATE)
         frames = [axis.send(Command.SET_INPUT_TORQUE, 0.0) for axis in self._axes]
-        return frames + [axis.send(Command.SET_AXIS_STATE, AxisState.IDLE) for axis in self._axes]
+        return frames + [self._halt_frame(axis) for axis in self._axes]
 
     def estop(self, time_ns: int) -> list[Frame]:
         """Returns frames after which the drives have an error and no torque; `start` clears and enables them."""
-        self._halt()
-        return [axis.send(Command.ESTOP) for axis in self._axes]
+        self._halt(Command.ESTOP)
+        return [self._halt_frame(axis) for axis in self._axes]
 
     def start(self) -> None:
         """Lets `poll` enable the drives (again), whatever was wrong before.  A new host is started."""
@@ -198,8 +200,11 @@ class ODriveHost:
         elif command is Command.GET_ERROR and values[0]:
             self._error(axis, time_ns, values[0])
 
-    def _halt(self) -> None:
-        self._started = False
+    def _halt_frame(self, axis: _Axis) -> Frame:
+        return axis.send(Command.ESTOP) if self._halts is Command.ESTOP else axis.send(self._halts, AxisState.IDLE)
+
+    def _halt(self, command: Command) -> None:
+        self._started, self._halts = False, command
         for axis in self._axes:
             axis.closed = False
             axis.asked_ns = None

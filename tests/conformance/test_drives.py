@@ -483,6 +483,43 @@ def test_stop_takes_the_torque_and_start_gives_it_back(name: str, how: str, faul
     assert not rig.host.enabled
 
 
+def test_an_estop_that_was_lost_is_repeated(name: str) -> None:
+    """By its own frames: nothing else of the host gets through."""
+    rig = enabled_rig(name)
+    estops = {frame[:2] for frame in rig.host.estop(rig.time_ns)}
+    repeated = []
+    for _ in range(CYCLES):
+        rig.advance(rig.time_ns)
+        rig.to_drives(rig.time_ns, rig.protocol.beginning(rig.plan, rig.time_ns))
+        frames = [*rig.host.poll(rig.time_ns), *rig.host.command(rig.time_ns, 0.5, 0.5)]
+        repeated += [frame for frame in frames if is_estop(name, frame)]
+        rig.to_drives(rig.time_ns, [frame for frame in frames if is_estop(name, frame)])
+        rig.time_ns += rig.plan.period_ns
+    assert estops
+    assert repeated
+    assert rig.torques() == [0.0, 0.0]
+
+
+def is_estop(name: str, frame: Frame) -> bool:
+    if name == "native":
+        return frame.data[4] & 32 != 0
+    if name == "odrive":
+        return frame.can_id & 31 == 2
+    return frame.can_id & 0x780 == 0x200 and frame.data[:2] == b"\x02\x00"
+
+
+def test_a_quick_stop_is_left_to_the_drive() -> None:
+    """No other controlword follows while it stops as it is configured to."""
+    rig = enabled_rig("cia402")
+    rig.to_drives(rig.time_ns, rig.host.estop(rig.time_ns))
+    rig.deaf = True  # and the drives are slow to say that they stopped
+    rig.commanded.clear()
+    rig.cycles(CYCLES, 0.5, 0.5)
+    words = [frame.data[:2] for _, frame in rig.commanded if frame.can_id & 0x780 == 0x200]
+    assert set(words) <= {b"\x02\x00", b"\x00\x00"}
+    assert b"\x00\x00" not in words[:2]
+
+
 @pytest.mark.parametrize("cycles", [0, 1, 2, 3])
 def test_an_estop_that_is_over_at_once(name: str, cycles: int) -> None:
     """Its fault is known to the host only after the start."""

@@ -7,7 +7,7 @@ What protocols ask for, their observers check (bridge.<protocol>.observe).  The 
     silent        it did not come at all for a watchdog and a period, or at the end
     missing       nothing at all came of an identifier, or of a robot
     burst         a cyclic frame came more than half a period before it was due, and nothing was owed
-    torque above limit, rise above limit, fall above limit
+    torque above limit, rise above limit, fall above limit, window above limit
                   commanded or reported, beyond the envelope by more than a bit; a command may be zero at any time
     torque not commanded
                   reported, but beyond all commands of the time in which they can have had an effect

@@ -18,6 +18,7 @@ from bridge.protocols import make_observer
 from echelon.plan import Plan, RobotPlan
 
 _WHEELS: Final = ("right", "left")
+_WINDOW_NS: Final = 250_000_000
 
 
 class WheelCheck:
@@ -34,6 +35,9 @@ class WheelCheck:
         slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
         self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns) + late_ns
         self._wheels = [Commands(self._effect_ns) for _ in _WHEELS]
+        # Frames wait for the bus: of two that are further apart here the envelope may have seen the first no more.
+        window_ns = _WINDOW_NS - 2 * drive.period_ns - late_ns
+        self._windows = [Window(window_ns) for _ in _WHEELS] if self.envelope.window_limit < inf else []
         self._begin_ns: int | None = None
 
     def silent(self, time_ns: int) -> bool:
@@ -49,12 +53,16 @@ class WheelCheck:
         stops = False
         if self._begin_ns is None:
             self._begin_ns = time_ns
-        for name, commands, reading in zip(_WHEELS, self._wheels, self.observer.wheels, strict=True):
+        for wheel, (name, commands, reading) in enumerate(
+            zip(_WHEELS, self._wheels, self.observer.wheels, strict=True)
+        ):
             if reading.commanded_ns != commands.commanded_ns and reading.commanded is not None:
                 commands.commanded_ns, stops = time_ns, not reading.commanded
                 if time_ns < 0 and reading.commanded:
                     said.append(("torque before the run", f"{name}: commanded {reading.commanded:g} N m"))
                 self._check_change(name, commands.torque, reading.commanded, said)
+                if self._windows:
+                    self._check_spread(name, self._windows[wheel].spread(time_ns, reading.commanded), said)
                 commands.add(time_ns, reading.commanded)
             if reading.reported_ns != commands.reported_ns and reading.reported is not None:
                 commands.reported_ns = time_ns
@@ -72,6 +80,11 @@ class WheelCheck:
             said.append(("rise above limit", f"{name}: from {before:g} to {torque:g} N m, by at most {rise:g}"))
         if abs(before) - common > fall * 1.000001 + self._bit:
             said.append(("fall above limit", f"{name}: from {before:g} to {torque:g} N m, by at most {fall:g}"))
+
+    def _check_spread(self, name: str, spread: float, said: list[tuple[str, str]]) -> None:
+        limit = self.envelope.window_limit
+        if spread > limit * 1.000001 + self._bit:
+            said.append(("window above limit", f"{name}: {spread:g} N m apart within 250 ms, at most {limit:g}"))
 
     def _check_report(
         self,
@@ -112,6 +125,25 @@ def _mirrored(robot: RobotPlan) -> tuple[Observer, dict[int, int]]:
     else:
         can_ids = [BASE_ID + robot.index]
     return observer, dict.fromkeys(can_ids, robot.period_ns)
+
+
+class Window:
+    """What one wheel was asked for in a stretch of time, since it was last asked for nothing."""
+
+    def __init__(self, length_ns: int) -> None:
+        self._length_ns = length_ns
+        self._torques: deque[tuple[int, float]] = deque()
+
+    def spread(self, time_ns: int, torque: float) -> float:
+        """Takes a command [N m]; returns by how much the largest and the smallest differ."""
+        torques = self._torques
+        if not torque:
+            torques.clear()
+        torques.append((time_ns, torque))
+        while torques[0][0] < time_ns - self._length_ns:
+            torques.popleft()
+        values = [value for _, value in torques]
+        return max(values) - min(values)
 
 
 class Commands:

@@ -4,6 +4,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -226,6 +227,36 @@ def test_torques_that_were_scaled(protocol: str) -> None:
     assert kinds(report, 2) == {"torque not commanded"}
     assert kinds(report, -1) == {"torque not commanded"}
     assert "torque above limit" in kinds(report, 60)
+
+
+@each_protocol
+def test_torques_that_are_too_far_apart_within_the_window(protocol: str) -> None:
+    plan, frames = run(protocol)
+    robot = plan.robots[0]
+    observer = Referee(plan).robots[0].observer
+    said = []  # what the right wheel was asked for, without what begins the window anew
+    for time_ns, _, frame in frames:
+        if frame.can_id == COMMAND_IDS[protocol][0] and time_ns > 0:
+            observer.observe(time_ns, frame)
+            said.append((time_ns, observer.wheels[0].commanded or 0.0))
+    zeros = [at for at, (_, torque) in enumerate(said) if not torque] + [len(said)]  # where the window begins anew
+    apart = max(
+        abs(one - other)
+        for first, last in pairwise([0, *zeros])
+        for at, (time_ns, one) in enumerate(said[first:last], first)
+        for other_ns, other in said[at:last]
+        if other_ns - time_ns <= 230 * MS
+    )
+    assert apart > 0.01
+
+    def kinds(limit: float) -> dict[str, int]:
+        envelope = replace(robot.envelope, window_limit=limit)
+        return judged(replace(plan, robots=(replace(robot, envelope=envelope), *plan.robots[1:])), frames).kinds
+
+    assert kinds(apart / 2)["window above limit"] > 0
+    assert kinds(apart / 2).keys() == {"window above limit"}
+    generous = 3 * apart + 0.05
+    assert kinds(generous) == {}
 
 
 def scaled_native(can_id: int, data: bytes, factor: int) -> bytes:

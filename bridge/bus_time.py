@@ -5,9 +5,8 @@ remote frame with the same identifier the data frame.  It takes the bits that `f
 last bit of its end of frame, and blocks the bus for three bits more.  A bit lasts 1/bitrate, the frame is rounded up to
 whole nanoseconds.
 
-Errors.  An attempt to send is destroyed with a given probability, at a bit that is drawn; then follow the error flag, its
-echo, the delimiter and the interframe space, and the frame waits again.  Draws come from Philox 4x64, keyed by seed and
-bus; their counter is the number of the attempt, so they do not depend on what was drawn before.
+Errors.  An attempt to send is destroyed with a given probability, at a bit that is drawn (bridge.error_draws); then follow the
+error flag, its echo, the delimiter and the interframe space, and the frame waits again.
 
 Error counters (ISO 11898-1, what a bus with one error at a time needs): the sender of a destroyed frame counts 8, each
 other node 1; each delivered frame takes 1 from its sender and from the receivers.  Over 127 a node is error passive and
@@ -21,18 +20,15 @@ Frames of others, whose queues this model does not have, took the bus before the
 that were sent meanwhile wait like all others, and take it then: so several models that hear each other share one bus.
 """
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
-import numpy as np
-from numpy.random import Philox
-
 from bridge.bus_load import frame_bits
 from bridge.bus_model import BusEvent, BusEventKind, BusModel, Delivered, Traffic
+from bridge.error_draws import INTERFRAME, ErrorDraws
 from bridge.frame import Frame
 
 CAPACITY = 64
@@ -40,11 +36,9 @@ CAPACITY = 64
 PASSIVE_OVER, OFF_OVER = 127, 255
 RECOVERED_REC = 119  # what an error passive receiver counts after a good frame: 119 .. 127 by the standard
 
-_INTERFRAME = 3
-_ERROR_FLAG, _ECHO_MAX, _ERROR_DELIMITER = 6, 6, 8
+_ERROR_FLAG, _ERROR_DELIMITER = 6, 8
 _SUSPEND = 8
 _RECESSIVE, _RECESSIVE_RUNS = 11, 128
-_BLOCK = 512  # attempts that are drawn at a time; each takes one count of the Philox counter, which is four words
 _EVER = -(2**62)
 _NEVER = 2**62
 _OTHERS = -1  # stands for the node of what was heard
@@ -118,11 +112,8 @@ class BusTime(BusModel):
         self._now_ns = _EVER  # everything earlier is decided
         self._order = self._busy_ns = 0
         self._others = 0  # frames of others that still have to take their time
-        digest = hashlib.blake2b(f"{seed}|bus {bus_number}".encode(), digest_size=16).digest()
-        self._key = int.from_bytes(digest, "little")
+        self._draws = ErrorDraws(seed, bus_number)
         self._attempts = 0
-        self._draws: list[list[float]] = []
-        self._draws_block = -1
         self.set_error_rate(error_rate)
 
     @property
@@ -137,7 +128,7 @@ class BusTime(BusModel):
             return None
         if self._rate or self._suspended or self._off:
             return self._next_start() + 1  # then it is known who sends, and how long
-        return self._next_start() + self._span(self._pending[0].bits - _INTERFRAME)
+        return self._next_start() + self._span(self._pending[0].bits - INTERFRAME)
 
     @property
     def busy_ns(self) -> int:
@@ -154,7 +145,7 @@ class BusTime(BusModel):
         return known.tec, known.rec
 
     def duration_ns(self, frame: Frame) -> int:
-        return self._span(frame_bits(frame.can_id, frame.data, frame.remote) - _INTERFRAME)
+        return self._span(frame_bits(frame.can_id, frame.data, frame.remote) - INTERFRAME)
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
         bits = frame_bits(frame.can_id, frame.data, frame.remote)
@@ -172,7 +163,7 @@ class BusTime(BusModel):
     def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
         bits = frame_bits(frame.can_id, frame.data, frame.remote)
         self._advance(time_ns)
-        span_ns = self._span(bits - _INTERFRAME)
+        span_ns = self._span(bits - INTERFRAME)
         began_ns = max(self._free_ns, min(end_ns, time_ns) - span_ns)
         if began_ns + span_ns <= time_ns:
             self._note_start(began_ns)
@@ -258,12 +249,16 @@ class BusTime(BusModel):
     def _begin(self, start_ns: int) -> None:
         current = self._pop(start_ns)
         self._note_start(start_ns)
-        hit = self._draw(current.bits) if self._rate and current.node != _OTHERS else None
+        hit = (
+            self._draws.hit(self._attempts, self._rate, current.bits)
+            if self._rate and current.node != _OTHERS
+            else None
+        )
         if hit is None:
-            on_bus, end = current.bits, current.bits - _INTERFRAME
+            on_bus, end = current.bits, current.bits - INTERFRAME
         else:
             end, echo = hit
-            on_bus = end + _ERROR_FLAG + echo + _ERROR_DELIMITER + _INTERFRAME
+            on_bus = end + _ERROR_FLAG + echo + _ERROR_DELIMITER + INTERFRAME
         self._attempts += 1
         self._current, self._destroyed = current, hit is not None
         self._end_ns = start_ns + self._span(end)
@@ -287,20 +282,6 @@ class BusTime(BusModel):
         for waiting in aside:
             heappush(self._pending, waiting)
         return first
-
-    def _draw(self, bits: int) -> tuple[int, int] | None:
-        """After how many bits the attempt is destroyed, and the echo's bits; None if it gets through.
-
-        The last bit of the frame is safe: receivers have the frame by then."""
-        block, at = divmod(self._attempts, _BLOCK)
-        if block != self._draws_block:
-            words = Philox(key=self._key, counter=block * _BLOCK).random_raw(4 * _BLOCK)
-            self._draws = np.multiply(words >> np.uint64(11), 2.0**-53).reshape(_BLOCK, 4).tolist()
-            self._draws_block = block
-        destroyed, where, echo, _ = self._draws[at]
-        if destroyed >= self._rate:
-            return None
-        return 1 + int(where * (bits - _INTERFRAME - 1)), int(echo * (_ECHO_MAX + 1))
 
     def _finish(self, current: _Waiting) -> None:
         end_ns, node, can_id = self._end_ns, current.node, current.frame.can_id

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from bridge.bridge import Bridge, Stop
 from bridge.bus_load import frame_bits
-from bridge.native.codec import CounterCheck, NativeCodec, Torque
+from bridge.native.codec import NativeCodec, Torque
+from bridge.native.counter import CounterCheck
 
 MS = 1_000_000
 CODEC = NativeCodec(0.001)

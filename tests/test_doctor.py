@@ -12,8 +12,9 @@ from runs import echelon, plan_of
 
 from bridge.bus import open_bus
 from bridge.bus_url import resolve_url
-from sim import doctor
-from sim.doctor import Finding, Measured
+from sim import can_checks, doctor
+from sim.doctor import Measured
+from sim.finding import Finding
 
 
 def test_this_machine_can_run_lab_and_says_so() -> None:
@@ -61,9 +62,9 @@ def test_multicast_is_tried() -> None:
     try:
         open_bus(resolve_url("udp_multicast")).close()
     except OSError:
-        assert doctor.check_multicast().state == "note"
+        assert can_checks.check_multicast().state == "note"
     else:
-        assert doctor.check_multicast().state == "ok"
+        assert can_checks.check_multicast().state == "ok"
 
 
 def test_a_check_that_hangs_or_raises_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,10 +94,10 @@ def test_a_missing_package_is_a_problem() -> None:
 
 
 def test_vcan_that_is_missing_or_not_up() -> None:
-    finding = doctor.check_vcan("nosuch0")
+    finding = can_checks.check_vcan("nosuch0")
     assert (finding.what, finding.state) == ("nosuch0", "note")
     assert "ip link add nosuch0 type vcan" in finding.advice[0] or "vcan.sh" in finding.advice[-1]
-    assert doctor.check_vcan("lo").state == "ok"
+    assert can_checks.check_vcan("lo").state == "ok"
 
 
 @pytest.mark.parametrize(("most", "state"), [(212_992, "note"), (4 << 20, "ok")])
@@ -120,7 +121,7 @@ def test_which_interfaces_are_can(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
         (tmp_path / name / "tx_queue_len").write_text(f"{queue}\n")
-    findings = doctor.check_interfaces(tmp_path)
+    findings = can_checks.check_interfaces(tmp_path)
     assert [finding.what for finding in findings] == ["can7", "vcan7"]
     assert "queue of 10 frames" in findings[0].text
     assert findings[0].advice[-1].endswith("ip link set can7 txqueuelen 1000")
@@ -151,7 +152,7 @@ def can(state: str, up: bool = True, bitrate: int | None = 500_000) -> dict[str,
     ],
 )
 def test_what_an_interface_needs(link: dict[str, Any], queue: int, text: str, advice: list[str]) -> None:
-    finding = doctor._interface("can0", queue, link)
+    finding = can_checks._interface("can0", queue, link)
     assert (finding.text, finding.state) == (text, "note" if advice else "ok")
     assert len(finding.advice) == len(advice)
     for one, wanted in zip(finding.advice, advice, strict=True):

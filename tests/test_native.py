@@ -12,7 +12,6 @@ from bridge.native.codec import (
     LENGTH,
     MAX_ROBOTS,
     RAW_MAX,
-    CounterCheck,
     FaultCode,
     Feedback,
     NativeCodec,
@@ -20,11 +19,12 @@ from bridge.native.codec import (
     Status,
     Torque,
     WheelState,
-    crc8,
     decode_status,
     encode_status,
     frame_id,
 )
+from bridge.native.counter import CounterCheck
+from bridge.native.crc import crc8
 
 MILLI = NativeCodec(0.001)
 

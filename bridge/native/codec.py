@@ -44,6 +44,9 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
+from bridge.native.counter import COUNTERS
+from bridge.native.crc import crc8
+
 BASE_ID = 0x100
 FEEDBACK_ID = 0x180
 STATUS_ID = 0x200
@@ -67,32 +70,8 @@ TEMPERATURE_OFFSET = -40.0
 STATUS_EVERY = 10
 """Feedback frames per status frame"""
 
-_COUNTERS = 16
-_BODY = struct.Struct("<hhBBB")  # bytes 0..6
-
-
-def _crc_table() -> bytes:
-    table = bytearray()
-    for byte in range(256):
-        remainder = byte
-        for _ in range(8):
-            remainder = (remainder << 1) ^ (0x11D if remainder & 0x80 else 0)
-        table.append(remainder)
-    return bytes(table)
-
-
-_CRC = _crc_table()
 _BYTES = tuple(bytes((value,)) for value in range(256))
-
-
-def crc8(data: bytes, start: int = 0xFF) -> int:
-    """CRC-8 SAE J1850 of `data`: polynomial 0x1D, start 0xFF, inverted at the end.
-
-    To continue after other data, `start` is their CRC, inverted."""
-    crc, table = start, _CRC
-    for byte in data:
-        crc = table[crc ^ byte]
-    return crc ^ 0xFF
+_BODY = struct.Struct("<hhBBB")  # bytes 0..6
 
 
 # Where the CRC of each identifier's frames stands after the identifier.
@@ -229,7 +208,7 @@ class NativeCodec:
             flags |= CLEAR
         if estop:
             flags |= ESTOP
-        body = _BODY.pack(round(right), round(left), flags, counter % _COUNTERS, 0)
+        body = _BODY.pack(round(right), round(left), flags, counter % COUNTERS, 0)
         return body + _BYTES[crc8(body, _START[BASE_ID + robot])], clipped
 
     def decode(self, can_id: int, data: bytes) -> Torque | Refusal:
@@ -248,7 +227,7 @@ class NativeCodec:
             bool(flags & CLIPPED),
             bool(flags & SATURATED),
             bool(flags & ESTOP),
-            counter % _COUNTERS,
+            counter % COUNTERS,
         )
 
     def encode_feedback(self, feedback: Feedback) -> bytes:
@@ -280,7 +259,7 @@ class NativeCodec:
             (right * self.scale, left * self.scale),
             (state_right, state_left),
             (fault_right, fault_left),
-            counter % _COUNTERS,
+            counter % COUNTERS,
         )
 
 
@@ -314,7 +293,7 @@ def decode_status(can_id: int, data: bytes) -> Status | Refusal:
         (right * SPEED_SCALE, left * SPEED_SCALE),
         voltage * VOLTAGE_SCALE,
         temperature + TEMPERATURE_OFFSET,
-        counter % _COUNTERS,
+        counter % COUNTERS,
     )
 
 
@@ -330,7 +309,7 @@ def _seal(base: int, robot: int, right: float, left: float, byte_4: int, counter
     if not (math.isfinite(right) and math.isfinite(left)):
         raise ValueError(f"wheel numbers must be finite, not {right!r} and {left!r} bits")
     right, left = max(-RAW_MAX, min(RAW_MAX, right)), max(-RAW_MAX, min(RAW_MAX, left))
-    body = _BODY.pack(round(right), round(left), byte_4, counter % _COUNTERS, byte_6)
+    body = _BODY.pack(round(right), round(left), byte_4, counter % COUNTERS, byte_6)
     return body + _BYTES[crc8(body, start)]
 
 
@@ -343,32 +322,3 @@ def _open(base: int, can_id: int, data: bytes) -> tuple[int, int, int, int, int]
         return Refusal.CRC
     parts: tuple[int, int, int, int, int] = _BODY.unpack_from(data)
     return Refusal.VALUE if parts[0] < -RAW_MAX or parts[1] < -RAW_MAX else parts
-
-
-@dataclass(slots=True)
-class CounterCheck:
-    """Finds frames that are missing, by the counter of one identifier's frames in the order they arrived.
-
-    A gap is only known modulo 16: sixteen frames lost in a row look like none, and fifteen like a repeated frame."""
-
-    frames: int = 0
-    missed: int = 0
-    repeated: int = 0
-    _last: int | None = None
-
-    def step(self, counter: int) -> int:
-        """Takes the next frame's counter; how many frames are missing before it, or -1 if it repeats the last one."""
-        self.frames += 1
-        last, self._last = self._last, counter
-        if last is None:
-            return 0
-        gap = (counter - last - 1) % _COUNTERS
-        if gap == _COUNTERS - 1:
-            self.repeated += 1
-            return -1
-        self.missed += gap
-        return gap
-
-    def forget(self) -> None:
-        """Takes whatever counter comes next: one of the two ends began anew."""
-        self._last = None

@@ -15,7 +15,6 @@ from bridge.native.codec import (
     FEEDBACK_ID,
     STATUS_EVERY,
     STATUS_ID,
-    CounterCheck,
     FaultCode,
     Feedback,
     NativeCodec,
@@ -25,6 +24,7 @@ from bridge.native.codec import (
     encode_status,
     frame_id,
 )
+from bridge.native.counter import CounterCheck
 from echelon.can_plan import DrivePlan
 
 CODES: Final = {

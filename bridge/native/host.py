@@ -11,7 +11,6 @@ from bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
     STATUS_ID,
-    CounterCheck,
     FaultCode,
     NativeCodec,
     Refusal,
@@ -20,6 +19,7 @@ from bridge.native.codec import (
     decode_status,
     frame_id,
 )
+from bridge.native.counter import CounterCheck
 from echelon.can_plan import NEVER_NS, DrivePlan
 
 SILENT: Final = "silent"

@@ -8,7 +8,6 @@ from bridge.native.codec import (
     FEEDBACK_ID,
     STATUS_EVERY,
     STATUS_ID,
-    CounterCheck,
     FaultCode,
     Feedback,
     NativeCodec,
@@ -18,6 +17,7 @@ from bridge.native.codec import (
     decode_status,
     frame_id,
 )
+from bridge.native.counter import CounterCheck
 from bridge.observe import Finding, WheelReading
 from echelon.can_plan import DrivePlan, EnvelopePlan
 

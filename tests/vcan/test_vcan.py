@@ -16,7 +16,7 @@ from bridge.bridge import Bridge, Frame
 from bridge.bus import Bus, open_bus
 from bridge.bus_url import listen_command, resolve_url
 from bridge.native.codec import NativeCodec, Torque
-from sim.doctor import check_interfaces, check_vcan
+from sim.can_checks import check_interfaces, check_vcan
 from tests.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan

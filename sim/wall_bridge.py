@@ -37,7 +37,7 @@ OTHER_NODE: Final = 1
 
 
 class WallBridge:
-    """The bridge on a wall clock.  Times are run time, `now` from a clock that starts at 0 with the run."""
+    """The bridge on a wall clock.  Times are run time, which is 0 when the run starts, at `begin`."""
 
     def __init__(self, spec: ProcessSpec, session: Session) -> None:
         plan = on_wall_clock(spec.plan)
@@ -71,12 +71,19 @@ class WallBridge:
         """By bus and identifier: when torque frames were queued, and of which instant they are"""
         self.came = 0
         self.latencies = array("q")
-        self.epoch_ns = 0
-        """When run time 0 is, since 1970"""
+        self._start_ns = self._epoch_ns = 0
         self.in_time = 0
         session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in plan.robots], self.mail.receive)
         self._wheels = session.publisher(data_key(spec.run, plan.stations[0].path, Channel.WHEELS))
         self._watch = session.publisher(watch_key(spec.run, "bridge", "bridge")) if spec.watched else None
+
+    def begin(self, start_ns: int) -> None:
+        """Takes note of when run time 0 is, on the monotonic clock."""
+        self._start_ns, self._epoch_ns = start_ns, epoch_ns_of(start_ns)
+
+    def now(self) -> int:
+        """Returns the run time."""
+        return time.monotonic_ns() - self._start_ns
 
     @property
     def due_ns(self) -> int:
@@ -93,9 +100,10 @@ class WallBridge:
         """True while robots are to be told what drives report, and where every frame is time that the bus is taken."""
         return self._told < self._cycle - 1 or self.plan.can.paced
 
-    def torques(self, now_ns: int) -> None:
+    def torques(self) -> None:
         """Takes robots' torques as their links let them arrive, and sends them."""
         for message in self.mail.take():
+            now_ns = self.now()
             if not self._plausible(now_ns, message):
                 count_refusal(self.mail.refused, "of another time")
                 continue
@@ -106,8 +114,8 @@ class WallBridge:
                 self._take(now_ns, message)
             else:
                 heappush(self._flying, (message.time_ns + delay_ns, message.source, message.sequence, message))
-        while self._flying and self._flying[0][0] <= now_ns:
-            self._take(now_ns, heappop(self._flying)[-1])
+        while self._flying and self._flying[0][0] <= self.now():
+            self._take(self.now(), heappop(self._flying)[-1])
 
     def _plausible(self, now_ns: int, message: Message) -> bool:
         """Holds a message against the clock: it is of a period of this run that has begun, and not long over."""
@@ -127,7 +135,7 @@ class WallBridge:
         for number, bus in enumerate(self.station.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
-                came_ns = min(received.time_ns - self.epoch_ns, now_ns)  # as the kernel saw it
+                came_ns = min(received.time_ns - self._epoch_ns, now_ns)  # as the kernel saw it
                 self._buses[number].hear(now_ns, frame, came_ns)
                 if not self._role.buses[number].is_off(BRIDGE_NODE):
                     self._role.receive(now_ns, number, frame)
@@ -255,29 +263,25 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
         raise StartError(str(error)) from None
     control.send(("bus", bridge.station.url))
     start_ns = meet(spec, session, control)
-    bridge.epoch_ns = epoch_ns_of(start_ns)
+    bridge.begin(start_ns)
     said_ns = -1 << 62
-
-    def now() -> int:
-        return time.monotonic_ns() - start_ns
-
     while True:
         # What drives say is of use when a period has ended; until then it can wait for the next torque.
         buses = bridge.station.buses if bridge.listens else ()
-        wait_for([control, bridge.mail, *buses], bridge.due_ns - now())
-        bridge.frames(now())
-        bridge.torques(now())
-        bridge.carry(now())
-        bridge.pass_time(now())
-        now_ns = now()
+        wait_for([control, bridge.mail, *buses], bridge.due_ns - bridge.now())
+        bridge.frames(bridge.now())
+        bridge.torques()
+        bridge.carry(bridge.now())
+        bridge.pass_time(bridge.now())
+        now_ns = bridge.now()
         if now_ns - said_ns >= PROGRESS_NS:
             said_ns = now_ns
             control.send(("progress", bridge.progress()))
         if control.poll():
             control.recv()
             break
-    bridge.frames(now())
-    bridge.stop(now())
+    bridge.frames(bridge.now())
+    bridge.stop(bridge.now())
     bridge.station.close()
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))

@@ -47,6 +47,8 @@ def make_can(can: Can, cycle_ns: int) -> CanPlan:
     ]
     if not can.virtual_drives and can.path != "closed":
         raise PlanError("can.virtual_drives = false: needs can.path = 'closed'")
+    if can.timing is not None and can.path != "closed":
+        raise PlanError(f"can.timing = {can.timing!r}: needs can.path = 'closed'")
     if not can.virtual_drives and can.timing is not None:
         raise PlanError(
             f"can.timing = {can.timing!r}: not with can.virtual_drives = false; real buses take their own time"

@@ -35,7 +35,7 @@ def check_wall_clock(plan: Plan, urls: Sequence[str]) -> None:
     if disturbed and not plan.can.paced:
         raise UsageError(
             f"events of kind {disturbed[0]!r}: on a wall clock a bus takes its own time, and errors as they come"
-            + ("; can.timing = 'bits' makes a virtual one as slow as a real one" if plan.can.virtual_drives else "")
+            + ("; --set can.timing=bits makes a virtual one as slow as a real one" if plan.can.virtual_drives else "")
         )
     real = [url for url in urls if (Path("/sys/class/net") / url.partition(":")[2] / "device").exists()]
     if plan.can.paced and real:

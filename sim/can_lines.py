@@ -29,6 +29,10 @@ def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
     faults = [f"{name} {row['fault']}" for name, row in can.get("robots", {}).items() if row.get("fault")]
     if faults:
         yield f"  drives   faults at the end: {_some(faults)}"
+    if idle := [
+        name for name, row in can.get("robots", {}).items() if not row.get("enabled", True) and not row["fault"]
+    ]:
+        yield f"  drives   not enabled at the end: {_some(idle)}"
     if referee := can.get("referee"):
         found = ", ".join(f"{number} {kind}" for kind, number in referee["kinds"].items()) or "nothing wrong"
         yield f"  referee  {referee['frames']} frames: {found}"
@@ -40,7 +44,8 @@ def can_reasons(can: Mapping[str, Any]) -> list[str]:
     if not referee or not referee["kinds"]:
         return []
     total, first = sum(referee["kinds"].values()), referee["findings"][0]
-    return [f"referee: {total} finding(s) on the bus, the first at {first['time']:.6g} s: {first['text']}"]
+    what = " ".join(filter(None, (first["bus"], first["id"], first["robot"], first["kind"])))
+    return [f"referee: {total} finding(s) on the bus, the first at {first['time']:.6g} s, {what}: {first['text']}"]
 
 
 def stopped_by_reason(can: Mapping[str, Any]) -> Counter[str]:

@@ -68,10 +68,10 @@ def _referee(referee: dict[str, Any]) -> str:
     found = ", ".join(f"{count} {kind}" for kind, count in referee["kinds"].items()) or "nothing wrong"
     text = subheading("Referee") + paragraph(f"It looked at {referee['frames']} frames and found {found}.")
     rows = [
-        [f"{row['time']:.6g}", row["bus"], row["id"], row["kind"], row["text"]]
+        [f"{row['time']:.6g}", row["bus"], row["id"], row["robot"], row["kind"], row["text"]]
         for row in referee["findings"][:MAX_ROWS]
     ]
-    return text + (table(["t [s]", "bus", "identifier", "kind", "what"], rows, numeric_from=5) if rows else "")
+    return text + (table(["t [s]", "bus", "identifier", "robot", "kind", "what"], rows, numeric_from=6) if rows else "")
 
 
 def _buses(buses: Any) -> str:

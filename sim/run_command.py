@@ -27,6 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
     if arguments.clock == "wall":
         check_wall_clock(plan, can_urls)
+    if plan.can.closed and arguments.engine == "processes" and not can_urls:
+        raise UsageError("--can none: the closed torque path of several processes needs a bus; or --engine inprocess")
     if plan.can.closed and arguments.engine == "processes" and any(url.startswith("virtual") for url in can_urls):
         raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
     if arguments.clock == "virtual" and not plan.can.virtual_drives:

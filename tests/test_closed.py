@@ -387,6 +387,17 @@ def test_a_drive_that_is_off_the_bus_comes_back_with_news_only() -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_drives_come_up_at_once_where_the_lower_identifier_goes_first(protocol: str) -> None:
+    """Nothing is refused, and all are enabled long before the run: no request overtakes what must come before it."""
+    plan = closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", "can.bring_up=0.5", duration=0.1)
+    engine = Engine(plan)
+    bridge, drives = stations(engine)
+    enabled_ns = next(at for at in engine.instants() if all(robot.host.enabled for robot in bridge.robots))
+    assert enabled_ns < 0
+    assert not sum(placed.drive.refused.total() for placed in drives.drives)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_drive_that_is_off_the_bus_hears_nothing_and_is_not_heard(protocol: str) -> None:
     """It takes the torque away by itself after the watchdog's time; and the bridge knows nothing of it until it is back."""
     event = 'events=[{kind="bus_off", at=0.505, robot="g1/r1"}]'

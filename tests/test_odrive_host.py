@@ -80,25 +80,33 @@ def torque_frames(right: float, left: float) -> list[tuple[int, str, dict[str, f
     ]
 
 
-def bring_up(axis: int, *, clear: bool = False) -> list[tuple[int, str, dict[str, Any]]]:
+def prepare(axis: int, *, clear: bool = False) -> list[tuple[int, str, dict[str, Any]]]:
     return [
         (axis, "Set_Controller_Mode", {"Control_Mode": "TORQUE_CONTROL", "Input_Mode": "PASSTHROUGH"}),
         *([(axis, "Clear_Errors", {"Identify": 0})] if clear else []),
-        (axis, "Set_Axis_State", {"Axis_Requested_State": "CLOSED_LOOP_CONTROL"}),
     ]
+
+
+def ask(axis: int) -> tuple[int, str, dict[str, Any]]:
+    return axis, "Set_Axis_State", {"Axis_Requested_State": "CLOSED_LOOP_CONTROL"}
 
 
 @pytest.mark.parametrize("start_ns", [-400 * MS, -30 * MS, 0])
 def test_bring_up(start_ns: int) -> None:
     robot = Robot(start_ns)
     robot.cycle(0.5, -0.25)
-    assert robot.names == [*bring_up(1), *bring_up(2), *torque_frames(0.0, 0.0)]
+    assert robot.names == [*prepare(1), *prepare(2), *torque_frames(0.0, 0.0)]
+    for _ in range(4):  # by identifier a request would overtake the mode
+        robot.cycle(0.5, -0.25)
+        assert robot.names == torque_frames(0.0, 0.0)
+    robot.cycle(0.5, -0.25)
+    assert robot.names == [ask(1), ask(2), *torque_frames(0.0, 0.0)]
     while not robot.host.enabled:
         assert robot.torques == (0.0, 0.0)
         robot.cycle(0.5, -0.25)
         assert robot.names == torque_frames(0.0, 0.0)
     # the next heartbeats told, and their cycle sends zeros
-    assert robot.now_ns - PERIOD_NS == (start_ns // (100 * MS) + 1) * 100 * MS
+    assert robot.now_ns - PERIOD_NS == ((start_ns + 50 * MS) // (100 * MS) + 1) * 100 * MS
     robot.cycle(0.5, -0.25)
     assert robot.names == torque_frames(0.5, -0.25)
     assert robot.torques == (0.5, -0.25)
@@ -113,7 +121,7 @@ def test_without_answers_it_asks_again_every_200_ms() -> None:
     host = ODriveHost(PLAN, 0)
     assert (host.torque, host.torque_ns) == ((0.0, 0.0), None)
     asked = [t for t in range(0, 1000, 10) if host.poll(t * MS)]
-    assert asked == [0, 200, 400, 600, 800]
+    assert asked == [0, 50, 250, 300, 500, 550, 750, 800]
     assert not host.enabled
     assert host.fault == ""  # never heard
 
@@ -145,7 +153,7 @@ def test_errors_from_before_are_cleared() -> None:
     for drive in robot.drives:
         drive.receive(0, frame(drive.plan.node_ids[drive.wheel], "Estop"))
     robot.cycle(0.5, -0.25)
-    assert robot.names == [*bring_up(1, clear=True), *bring_up(2, clear=True), *torque_frames(0.0, 0.0)]
+    assert robot.names == [*prepare(1, clear=True), *prepare(2, clear=True), *torque_frames(0.0, 0.0)]
     assert robot.host.fault == "right: ESTOP_REQUESTED; left: ESTOP_REQUESTED"
     robot.up()
     assert robot.host.fault == ""
@@ -155,9 +163,9 @@ def test_an_error_it_did_not_know_of_when_it_asked() -> None:
     robot = Robot(3 * MS)  # no heartbeat yet
     robot.drives[0].receive(3 * MS, frame(1, "Estop"))
     robot.cycle()
-    assert robot.names == [*bring_up(1), *bring_up(2), *torque_frames(0.0, 0.0)]
+    assert robot.names == [*prepare(1), *prepare(2), *torque_frames(0.0, 0.0)]
     robot.run(10)
-    assert robot.names == [*bring_up(1, clear=True), *torque_frames(0.0, 0.0)]  # at the first heartbeat, not 200 ms on
+    assert robot.names == [*prepare(1, clear=True), *torque_frames(0.0, 0.0)]  # at the first heartbeat, not 200 ms on
     robot.run(10)
     assert robot.host.enabled
 
@@ -198,7 +206,9 @@ def test_recovery_after_its_time(fault: Fault) -> None:
         robot.cycle(0.5, -0.25)
         assert robot.names == torque_frames(0.0, 0.0)
     robot.cycle(0.5, -0.25)
-    assert robot.names == [*bring_up(1, clear=fault is not Fault.SILENT), *torque_frames(0.0, 0.0)]
+    assert robot.names == [*prepare(1, clear=fault is not Fault.SILENT), *torque_frames(0.0, 0.0)]
+    robot.run(5, 0.5, -0.25)
+    assert robot.names == [ask(1), *torque_frames(0.0, 0.0)]
     robot.run(12, 0.5, -0.25)
     assert robot.torques == (0.5, -0.25)
     assert robot.host.fault == ""
@@ -252,6 +262,7 @@ NOTHING = frame(1, "Get_Torques")
 )
 def test_an_axis_that_gives_no_torque(cycles: int, report: Frame, fault: str) -> None:
     host = ODriveHost(PLAN, 0)
+    host.poll(-50 * MS)
     host.poll(0)
     for axis in (1, 2):
         host.receive(0, frame(axis, "Heartbeat", Axis_State="CLOSED_LOOP_CONTROL"))

@@ -154,7 +154,7 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
     assert "100 5 1 2 1 2 3 101 5 1 2 1 2 –" in text
     assert "g1/r1 odrive right: hot 3 rise limit 71.25" in text
     assert "11 frames and found 1 gap" in text
-    assert "1.5 can0 100 gap <late>" in text
+    assert "1.5 can0 100 g1/r1 gap <late>" in text
 
 
 def test_text_is_escaped(single):

@@ -21,6 +21,9 @@ from echelon.can_plan import DrivePlan
 
 RETRY_NS: Final = 200_000_000
 """Two heartbeats: so long an answer may take"""
+SETTLE_NS: Final = 50_000_000
+"""Between the mode of an axis and the request to take torque, which has the lower identifier: on a busy bus it would be there
+first, and the axis close its loop in another mode"""
 SILENT: Final = "silent"
 NO_TORQUE: Final = "gives no torque"
 _WHEELS: Final = ("right", "left")
@@ -44,6 +47,8 @@ class _Axis:
     pushed_ns: int | None = None
     """Since then its commands are not zero"""
     heard_ns: int | None = None
+    prepared_ns: int | None = None
+    """When it was told its mode, and is yet to be asked to take torque"""
     asked_ns: int | None = None
     torque: float = 0.0
     torque_ns: int | None = None
@@ -53,11 +58,20 @@ class _Axis:
         """True if it was asked to take torque, and again since what went wrong, if anything did."""
         return self.asked_ns is not None and (self.fresh or not self.fault or self.asked_ns >= self.fault_ns)
 
-    def bring_up(self) -> list[Frame]:
+    def bring_up(self, time_ns: int) -> list[Frame]:
+        """Returns what is due of two steps: mode, and errors cleared; then the request to take torque."""
+        if self.prepared_ns is not None:
+            if time_ns - self.prepared_ns < SETTLE_NS:
+                return []
+            self.prepared_ns, self.asked_ns = None, time_ns
+            return [self.send(Command.SET_AXIS_STATE, AxisState.CLOSED_LOOP_CONTROL)]
+        self.prepared_ns = time_ns
         frames = [self.send(Command.SET_CONTROLLER_MODE, ControlMode.TORQUE_CONTROL, InputMode.PASSTHROUGH)]
-        if self.errors:
-            frames.append(self.send(Command.CLEAR_ERRORS, 0))
-        return [*frames, self.send(Command.SET_AXIS_STATE, AxisState.CLOSED_LOOP_CONTROL)]
+        return [*frames, self.send(Command.CLEAR_ERRORS, 0)] if self.errors else frames
+
+    def forget(self) -> None:
+        """What it was asked is void."""
+        self.prepared_ns = self.asked_ns = None
 
     def send(self, command: Command, *values: float) -> Frame:
         return Frame(frame_id(self.node, command), MESSAGES[command].encode(*values))
@@ -131,8 +145,7 @@ class ODriveHost:
                     frames.append(self._halt_frame(axis))
                     axis.asked_ns = time_ns
             elif axis.fresh or not axis.fault or self._may_recover(axis, time_ns):
-                frames += axis.bring_up()
-                axis.asked_ns = time_ns
+                frames += axis.bring_up(time_ns)
         return frames
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
@@ -148,7 +161,7 @@ class ODriveHost:
         for axis, can_id, torque in zip(self._axes, self._torque_ids, (tau_right, tau_left), strict=True):
             if not isfinite(torque):
                 raise ValueError(f"torques must be finite, not {tau_right!r} and {tau_left!r}")
-            torque = max(-limit, min(limit, torque))
+            torque = max(-limit, min(limit, torque)) + 0.0  # and no -0.0
             if abs(torque) <= ZERO_TORQUE:
                 axis.pushed_ns = None
             elif axis.pushed_ns is None:
@@ -172,7 +185,7 @@ class ODriveHost:
         self._started = True
         for axis in self._axes:
             axis.fresh = True
-            axis.asked_ns = None
+            axis.forget()
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""
@@ -207,7 +220,7 @@ class ODriveHost:
         self._started, self._halts = False, command
         for axis in self._axes:
             axis.closed = False
-            axis.asked_ns = None
+            axis.forget()
 
     def _may_recover(self, axis: _Axis, time_ns: int) -> bool:
         after_ns = recovers_after_ns(self.plan, time_ns)
@@ -215,7 +228,7 @@ class ODriveHost:
 
     def _error(self, axis: _Axis, time_ns: int, errors: int) -> None:
         if not axis.errors:
-            axis.asked_ns = None  # asked without knowing: `Clear_Errors` was missing
+            axis.forget()  # asked without knowing: `Clear_Errors` was missing
         axis.errors = errors
         axis.fail(time_ns, error_names(errors))
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from bridge.bus import Bus, open_bus
 from bridge.bus_url import listen_command
-from bridge.buses import bus_row
+from bridge.buses import bus_row, scheduled
 from bridge.canlog import CanLog
 from bridge.commander import Commander
 from bridge.fit import plan_fit
@@ -119,6 +119,7 @@ class ClosedStation:
             "fit": fit[0].lines[0] if len(fit) == 1 else [bus.lines[0] for bus in fit],
             "advice": [way for bus in fit for way in bus.advice],
             "buses": buses,
+            "scheduled": scheduled(self.plan),
             "sent": sum(bus.counts.sent for bus in self.buses),
             "failed": sum(bus.counts.failed for bus in self.buses),
             "dropped": sum(bus.counts.dropped for bus in self.buses),

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
+from bridge.buses import lost_row
 from bridge.frame import Drive, Frame
 from bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
 from bridge.motor import Fault
@@ -33,8 +34,8 @@ class PlacedDrive:
         self.outbox: list[Frame] = []
         self.waiting = 0
         """Frames that it sent and that the bus did not carry yet"""
-        self.lost = 0
-        """Frames that its queue had no room for"""
+        self.lost: Counter[int] = Counter()
+        """Frames that its queue had no room for, by identifier"""
         self.is_off = False
         """Its controller is off the bus, and hears nothing"""
 
@@ -96,7 +97,7 @@ class DriveBank:
             frames = placed.outbox + placed.drive.advance(time_ns)
             placed.outbox = []
             room = max(0, self._capacity - placed.waiting)
-            placed.lost += max(0, len(frames) - room)
+            placed.lost.update(frame.can_id for frame in frames[room:])
             for frame in frames[:room]:
                 placed.waiting += 1
                 said.append(TimedFrame(time_ns, placed.place.bus, placed.place.node, frame))
@@ -194,8 +195,12 @@ class DriveBank:
         return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
     def result(self) -> dict[str, Any]:
-        """Returns what there is to say of the drives for a run's summary."""
-        return {"robots": self.summary(), "refused": dict(self.refused)}
+        """Returns what there is to say of the drives for a run's summary; `buses` are for `bridge.buses.merge_rows`."""
+        lost: list[Counter[int]] = [Counter() for _ in self._plan.can.buses]
+        for placed in self.drives:
+            lost[placed.place.bus] += placed.lost
+        buses = [lost_row(of_bus) for of_bus in lost]
+        return {"robots": self.summary(), "refused": dict(self.refused), "buses": buses}
 
     def summary(self) -> dict[str, Any]:
         """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""
@@ -205,6 +210,6 @@ class DriveBank:
         for placed in self.drives:
             row = rows[self._plan.robots[placed.place.robot].name]
             row["refused"] += placed.drive.refused
-            row["lost"] += placed.lost
+            row["lost"] += placed.lost.total()
             row["temperature"] = max(row["temperature"], *(motor.temperature for motor in placed.drive.motors))
         return rows

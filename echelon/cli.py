@@ -57,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
     def listening(command: argparse.ArgumentParser) -> None:
         scenario(command, more=", or the folder of a run")
         command.add_argument("--can", metavar="URL", help="where to listen; of several buses all, with commas between")
-        command.add_argument("--seconds", type=float, metavar="S", help="end after so long (default: at Ctrl-C)")
+        command.add_argument("--seconds", type=_seconds, metavar="S", help="end after so long (default: at Ctrl-C)")
         command.add_argument("--json", action="store_true", help="print JSON")
 
     run = add("run", "run a scenario; leaves a folder with recording, summary and report")
@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--no-report", action="store_true", help="write no report.html")
     run.add_argument(
         "--stall-timeout",
-        type=float,
+        type=_seconds,
         default=30.0,
         metavar="S",
         help="give a run up that stands still for so long (virtual time; default: 30)",
@@ -118,7 +118,7 @@ def parser() -> argparse.ArgumentParser:
     drives = add("drives", "run the virtual drives of a scenario alone, on a bus in real time, to try hosts on")
     scenario(drives)
     drives.add_argument("--can", metavar="URL", help="socketcan:vcan0, udp_multicast:<group>:<port>, or auto")
-    drives.add_argument("--seconds", type=float, metavar="S", help="end after so long (default: with Ctrl-C)")
+    drives.add_argument("--seconds", type=_seconds, metavar="S", help="end after so long (default: with Ctrl-C)")
 
     doctor = add("doctor", "say what this machine can do, and whether a scenario fits it")
     scenario(doctor, optional=True)
@@ -136,6 +136,17 @@ def parser() -> argparse.ArgumentParser:
         "--tolerance", type=float, metavar="S", help="how late a cyclic frame may be, live (default: half its period)"
     )
     return top
+
+
+def _seconds(text: str) -> float:
+    """A duration [s] as an argument."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is no duration in seconds, more than 0")
+    return seconds
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 SHOWN: Final = 5
 """How many of many are listed."""
+_COUNTS: Final = {"lost": "lost", "destroyed and sent again": "destroyed"}
 
 
 def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
@@ -23,6 +24,12 @@ def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
     else:
         yield f"  CAN      {', '.join(facts)}"
         yield from (f"  bus      {line}" for line in fit)
+    if events := can.get("scheduled"):
+        told = [f"{event['time']:g} s {event['what']}" for event in events]
+        yield f"  events   {_some(told)}"
+    if off := [event for bus in can.get("buses", ()) for event in bus["events"] if event["event"] == "bus-off"]:
+        told = [f"{event['who']} at {event['time']:.4g} s" for event in off]
+        yield f"  bus-off  {_some(told)}"
     if stopped := stopped_by_reason(can):
         reasons = ", ".join(f"{number} {reason}" for reason, number in stopped.most_common(SHOWN))
         yield f"  stopped  torques that became zero before the bus: {reasons}"
@@ -55,10 +62,7 @@ def stopped_by_reason(can: Mapping[str, Any]) -> Counter[str]:
 
 def _bus_counts(can: Mapping[str, Any]) -> dict[str, int]:
     buses = can.get("buses", ())
-    lost = sum(bus["lost"] for bus in buses) + sum(
-        row["lost"] for row in can.get("drives", {}).get("robots", {}).values()
-    )
-    return {"lost": lost, "destroyed and sent again": sum(bus["destroyed"] for bus in buses)}
+    return {what: sum(bus[key] for bus in buses) for what, key in _COUNTS.items()}
 
 
 def _some(texts: list[str]) -> str:

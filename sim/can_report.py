@@ -36,6 +36,7 @@ def can_section(can: dict[str, Any], frames: Sequence[Mapping[str, object]]) -> 
         text += paragraph("To make it fit: " + "; ".join(advice) + ".")
     if referee := can.get("referee"):
         text += _referee(referee)
+    text += _happened(can)
     text += _buses(can.get("buses", ()))
     text += _robots(can)
     if frames:
@@ -49,7 +50,8 @@ def _sentences(can: dict[str, Any]) -> list[str]:
     words = []
     if (mean := can.get("load_mean")) is not None:
         over = " — more than it can carry" if mean > 1 else ""
-        words.append(f"A real bus would be loaded to {100 * mean:.3g} %{over}.")
+        which = "The busiest of the buses" if len(can.get("buses", ())) > 1 else "The bus"
+        words.append(f"{which} would be loaded to {100 * mean:.3g} %{over}, if it were real.")
     stopped = stopped_by_reason(can)
     if stopped.total():
         reasons = ", ".join(f"{count} times {reason}" for reason, count in stopped.most_common())
@@ -72,6 +74,27 @@ def _referee(referee: dict[str, Any]) -> str:
         for row in referee["findings"][:MAX_ROWS]
     ]
     return text + (table(["t [s]", "bus", "identifier", "robot", "kind", "what"], rows, numeric_from=6) if rows else "")
+
+
+def _happened(can: dict[str, Any]) -> str:
+    """Returns what was on schedule, and which controllers left their bus, in order of time."""
+    rows = [
+        (event["time"], "scheduled", ", ".join(event["whom"]), event["what"] + _until(event["until"]))
+        for event in can.get("scheduled", ())
+    ]
+    rows += [
+        (event["time"], bus["name"], event["who"], event["event"])
+        for bus in can.get("buses", ())
+        for event in bus["events"]
+    ]
+    if not rows:
+        return ""
+    shown = [[f"{time:.6g}", *rest] for time, *rest in sorted(rows)[:MAX_ROWS]]
+    return subheading("What happened") + table(["t [s]", "", "who", "what"], shown, numeric_from=4)
+
+
+def _until(time_s: float | None) -> str:
+    return "" if time_s is None else f", until {time_s:.6g} s"
 
 
 def _buses(buses: Any) -> str:

@@ -209,11 +209,13 @@ def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
         return {}
     result: dict[str, Any] = station.result()
     if engine.plan.stations[1:]:
+        from bridge.buses import merge_rows
         from bridge.drive_bank import DriveBank
 
         drives = engine.roles[engine.plan.stations[1].index]
         assert isinstance(drives, DriveBank)
         result["drives"] = drives.result()
+        merge_rows(result["buses"], result["drives"].pop("buses"))
     return result
 
 

@@ -123,7 +123,7 @@ def test_verdict_claims_and_numbers_are_on_the_page(single):
     assert "centroid within 0.05 of its largest error by 1 s, but it did not settle" in text
     assert "intra within 5 % 0.1 s 0.06 s holds" in text
     assert "centroid within 5 % 1 s never fails" in text
-    assert "loaded to 50 %." in text
+    assert "loaded to 50 %," in text
     assert "In 7 frames a torque did not fit" in text
     assert "g1/r2 → g1" in text
 
@@ -135,11 +135,13 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
             "name": "can0",
             "bitrate": 500_000,
             "load": 0.25,
+            "events": [{"time": 2.5, "node": 1, "who": "g1/r1", "event": "bus-off"}],
             "identifiers": {"100": identifier | {"latency_bound": 3e-3}, "101": identifier | {"latency_bound": None}},
         }
     ]
     finding = {"time": 1.5, "bus": "can0", "id": "100", "kind": "gap", "text": "<late>", "robot": "g1/r1"}
     can = {
+        "scheduled": [{"time": 2.0, "until": 4.0, "what": "estop", "whom": ["g1/r1", "g1/r2"]}],
         "frames": 11,
         "load_mean": 0.25,
         "buses": buses,
@@ -149,12 +151,13 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
     }
     one = for_report(run, "bus")
     text = rendered([replace(one, summary=one.summary | {"can": can})], tmp_path / "report.html").text
-    assert "loaded to 25 %." in text
+    assert "loaded to 25 %," in text
     assert "became zero before the bus: 3 times rise limit" in text
     assert "100 5 1 2 1 2 3 101 5 1 2 1 2 –" in text
     assert "g1/r1 odrive right: hot 3 rise limit 71.25" in text
     assert "11 frames and found 1 gap" in text
     assert "1.5 can0 100 g1/r1 gap <late>" in text
+    assert "2 scheduled g1/r1, g1/r2 estop, until 4 s 2.5 can0 g1/r1 bus-off" in text
 
 
 def test_text_is_escaped(single):

@@ -99,13 +99,14 @@ class _Wheel:
     def violation(self, now_ns: int, torque: float) -> Violation | None:
         """Holds a finite torque against the limits; takes it as sent if it keeps them."""
         plan, sent = self.plan, self.sent
-        # what both magnitudes have in common: the torque falls to it, then rises from it
-        common = max(0.0, min(torque, sent), min(-torque, -sent))
-        if abs(torque) > plan.torque_limit:
+        size, before = abs(torque), abs(sent)
+        # what both have in common: the magnitude falls to it, then rises from it
+        common = min(size, before) if (torque > 0.0) is (sent > 0.0) else 0.0
+        if size > plan.torque_limit:
             return Violation.TORQUE
-        if abs(torque) > common + plan.rise_limit:
+        if size > common + plan.rise_limit:
             return Violation.RISE
-        if abs(sent) - plan.fall_limit > common:
+        if before - plan.fall_limit > common:
             return Violation.FALL
         if _largest(self.highs, now_ns, torque) + _largest(self.lows, now_ns, -torque) > plan.window_limit:
             return Violation.WINDOW

@@ -35,7 +35,13 @@ CALLS = {"min": "max", "max": "min", "popleft": "pop", "pop": "popleft"}
 
 # What changes nothing, as (line, line of the mutant): of two equal values the window may keep both or only the later.
 # With both, the earlier one stands in front and leaves first; the later one, then in front, is the same value.
-EQUIVALENT = {("while window and window[-1][1] <= value:", "while window and window[-1][1] < value:")}
+# And a torque of zero has nothing in common with any other, whatever its sign is taken for.
+COMMON = "common = min(size, before) if (torque {} 0.0) is (sent {} 0.0) else 0.0"
+EQUIVALENT = {
+    ("while window and window[-1][1] <= value:", "while window and window[-1][1] < value:"),
+    (COMMON.format(">", ">"), COMMON.format(">=", ">")),
+    (COMMON.format(">", ">"), COMMON.format(">", ">=")),
+}
 
 
 def changes(node: ast.AST) -> Iterator[ast.AST]:
@@ -73,6 +79,9 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
                 yield ast.Call(node.func, node.args[:left_out] + node.args[left_out + 1 :], node.keywords)
             else:
                 yield node.args[left_out]
+    elif isinstance(node, ast.IfExp):
+        yield ast.IfExp(ast.UnaryOp(ast.Not(), node.test), node.body, node.orelse)
+        yield from (node.body, node.orelse)
     elif isinstance(node, ast.If | ast.While):
         yield type(node)(ast.UnaryOp(ast.Not(), node.test), node.body, node.orelse)
         yield ast.Pass()

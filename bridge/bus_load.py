@@ -56,6 +56,15 @@ for _state, _row in _STUFF.items():
     _AFTER[_state], _ADDED[_state] = np.array(_row).T
 
 
+def check_frame(can_id: int, data: bytes, remote: bool = False) -> None:
+    """Raises ValueError for an identifier of more than 11 bits, more than 8 bytes, or a remote frame with data."""
+    if not 0 <= can_id < 0x800:
+        raise ValueError(f"identifier must have 11 bits, not {can_id:#x}")
+    _check_length(len(data))
+    if remote and data:
+        raise ValueError(f"a remote frame has no data, not {len(data)} bytes")
+
+
 def _check_length(length: int) -> None:
     if not 0 <= length <= 8:
         raise ValueError(f"a classic CAN frame has 0 .. 8 bytes, not {length}")
@@ -64,13 +73,8 @@ def _check_length(length: int) -> None:
 def frame_bits(can_id: int, data: bytes, remote: bool = False) -> int:
     """Bits that this very frame takes on the bus: stuffing as it really happens, and 3 bits of interframe space.
 
-    A remote frame has the RTR bit set and no data; its length code is taken to be 0.
-    Raises ValueError for an identifier of more than 11 bits, more than 8 bytes, or a remote frame with data."""
-    if not 0 <= can_id < 0x800:
-        raise ValueError(f"identifier must have 11 bits, not {can_id:#x}")
-    _check_length(len(data))
-    if remote and data:
-        raise ValueError(f"a remote frame has no data, not {len(data)} bytes")
+    A remote frame has the RTR bit set and no data; its length code is taken to be 0.  Raises as `check_frame` does."""
+    check_frame(can_id, data, remote)
     # start of frame (0), identifier, RTR, IDE and r0 (0) and length code: 19 bits, here behind five zeros, which leave
     # a CRC that starts with zero as it is
     start = can_id << 7 | remote << 6 | len(data)

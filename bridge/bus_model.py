@@ -24,7 +24,7 @@ class BusEventKind(StrEnum):
     """What can happen to a node."""
 
     ERROR = "error"
-    """A frame of the node was destroyed"""
+    """A frame of the node was destroyed; noted only where a bus is asked to"""
     PASSIVE = "error passive"
     ACTIVE = "error active"
     """Error passive no longer"""
@@ -64,6 +64,11 @@ class Traffic:
     def latency_mean_ns(self) -> float:
         """Mean latency of what was delivered; 0 before."""
         return self.latency_sum_ns / self.delivered if self.delivered else 0.0
+
+    def expire(self) -> None:
+        """One that was delivered was too old to be of use: it counts as lost."""
+        self.delivered -= 1
+        self.lost += 1
 
     def deliver(self, latency_ns: int) -> None:
         """Counts one that was delivered."""

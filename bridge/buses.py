@@ -3,15 +3,15 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bridge.bus_model import BusEventKind, BusModel, Traffic
+from bridge.bus_model import BusModel, Traffic
 from bridge.bus_time import BusTime
+from bridge.frame import WHEELS
 from bridge.frame_message import BRIDGE_NODE
 from bridge.ideal_bus import IdealBus
 from bridge.protocols import DrivePlace, drive_places
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
 
-WHEELS = ("right", "left")
 EVENTS = 1000
 """Told of a bus, at most"""
 
@@ -33,7 +33,6 @@ def bus_row(plan: Plan, number: int, model: BusModel, bounds_ns: Mapping[int, in
     their bounds those of the cyclic frames without errors."""
     bus, traffic = plan.can.buses[number], dict(sorted(model.traffic.items()))
     names = {place.node: _name(plan, place) for place in drive_places(plan)} | {BRIDGE_NODE: "bridge"}
-    events = [event for event in model.events if event.kind is not BusEventKind.ERROR]
     return {
         "name": bus.name,
         "bitrate": bus.bitrate,
@@ -42,7 +41,7 @@ def bus_row(plan: Plan, number: int, model: BusModel, bounds_ns: Mapping[int, in
         "destroyed": sum(row.retransmitted for row in traffic.values()),
         "events": [
             {"time": event.time_ns / 1e9, "node": event.node, "who": names[event.node], "event": event.kind.value}
-            for event in events[:EVENTS]
+            for event in model.events[:EVENTS]
         ],
         "identifiers": {f"{can_id:03X}": _identifier(row, bounds_ns.get(can_id)) for can_id, row in traffic.items()},
     }

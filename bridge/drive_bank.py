@@ -195,12 +195,15 @@ class DriveBank:
         return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
     def result(self) -> dict[str, Any]:
-        """Returns what there is to say of the drives for a run's summary; `buses` are for `bridge.buses.merge_rows`."""
+        """Returns what there is to say of the drives for a run's summary."""
+        return {"robots": self.summary(), "refused": dict(self.refused)}
+
+    def lost_rows(self) -> list[dict[str, Any]]:
+        """Returns what was lost before it came to a bus, bus by bus, for `bridge.buses.merge_rows`."""
         lost: list[Counter[int]] = [Counter() for _ in self._plan.can.buses]
         for placed in self.drives:
             lost[placed.place.bus] += placed.lost
-        buses = [lost_row(of_bus) for of_bus in lost]
-        return {"robots": self.summary(), "refused": dict(self.refused), "buses": buses}
+        return [lost_row(of_bus) for of_bus in lost]
 
     def summary(self) -> dict[str, Any]:
         """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""

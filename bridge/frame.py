@@ -5,10 +5,13 @@ What comes from the bus is checked, counted in `refused`, and dropped; it never 
 """
 
 from collections import Counter
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from bridge.motor import Fault, Motor
 from echelon.can_plan import DrivePlan
+
+WHEELS: Final = ("right", "left")
+"""The wheels of a robot, in the order of all pairs"""
 
 
 class Frame(NamedTuple):

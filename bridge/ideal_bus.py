@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Mapping
 
-from bridge.bus_load import frame_bits
+from bridge.bus_load import check_frame
 from bridge.bus_model import BusEvent, BusModel, Delivered, Traffic
 from bridge.frame import Frame
 
@@ -36,11 +36,11 @@ class IdealBus(BusModel):
         return 0.0
 
     def duration_ns(self, frame: Frame) -> int:
-        frame_bits(frame.can_id, frame.data, frame.remote)
+        check_frame(*frame)
         return 0
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
-        frame_bits(frame.can_id, frame.data, frame.remote)
+        check_frame(*frame)
         self._advance(time_ns)
         self._traffic[frame.can_id].sent += 1
         self._delivered.append(Delivered(time_ns, time_ns, node, frame))

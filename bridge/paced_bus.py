@@ -15,12 +15,10 @@ from bridge.frame import Frame
 class PacedBus:
     """A bus and its model.  Times are run time, and never run backwards.
 
-    After a standstill, frames that were over for more than `old_ns` are not sent any more."""
+    After a standstill, frames that were over for more than `old_ns` are not sent any more, and count as lost."""
 
     def __init__(self, bus: Bus, model: BusModel, old_ns: int) -> None:
         self.bus, self.model = bus, model
-        self.expired = 0
-        """Frames that were too old"""
         self._old_ns = old_ns
         self._seen = 0
 
@@ -42,7 +40,7 @@ class PacedBus:
         for sent in self.model.run(time_ns):
             can_id, data, remote = sent.frame
             if time_ns - sent.end_ns > self._old_ns:
-                self.expired += 1
+                self.model.traffic[can_id].expire()
             elif self.bus.send(can_id, data, remote=remote):
                 taken.append(sent)
         events = self.model.events

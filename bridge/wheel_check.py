@@ -8,6 +8,7 @@ from math import inf
 from typing import Final
 
 from bridge.cia402.codec import RPDO_IDS
+from bridge.frame import WHEELS
 from bridge.native.codec import BASE_ID
 from bridge.observe import Observer
 from bridge.odrive.codec import frame_id
@@ -17,7 +18,6 @@ from bridge.odrive.observe import ODriveObserver
 from bridge.protocols import make_observer
 from echelon.plan import Plan, RobotPlan
 
-_WHEELS: Final = ("right", "left")
 _WINDOW_NS: Final = 250_000_000
 
 
@@ -34,10 +34,10 @@ class WheelCheck:
         self._bit = bits[drive.protocol] * 1.000001
         slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
         self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns) + late_ns
-        self._wheels = [Commands(self._effect_ns) for _ in _WHEELS]
+        self._wheels = [Commands(self._effect_ns) for _ in WHEELS]
         # Frames wait for the bus: of two that are further apart here the envelope may have seen the first no more.
         window_ns = _WINDOW_NS - 2 * drive.period_ns - late_ns
-        self._windows = [Window(window_ns) for _ in _WHEELS] if self.envelope.window_limit < inf else []
+        self._windows = [Extremes(window_ns) for _ in WHEELS] if self.envelope.window_limit < inf else []
         self._begin_ns: int | None = None
 
     def silent(self, time_ns: int) -> bool:
@@ -53,16 +53,14 @@ class WheelCheck:
         stops = False
         if self._begin_ns is None:
             self._begin_ns = time_ns
-        for wheel, (name, commands, reading) in enumerate(
-            zip(_WHEELS, self._wheels, self.observer.wheels, strict=True)
-        ):
+        for wheel, (name, commands, reading) in enumerate(zip(WHEELS, self._wheels, self.observer.wheels, strict=True)):
             if reading.commanded_ns != commands.commanded_ns and reading.commanded is not None:
                 commands.commanded_ns, stops = time_ns, not reading.commanded
                 if time_ns < 0 and reading.commanded:
                     said.append(("torque before the run", f"{name}: commanded {reading.commanded:g} N m"))
                 self._check_change(name, commands.torque, reading.commanded, said)
                 if self._windows:
-                    self._check_spread(name, self._windows[wheel].spread(time_ns, reading.commanded), said)
+                    self._check_spread(time_ns, name, self._windows[wheel], reading.commanded, said)
                 commands.add(time_ns, reading.commanded)
             if reading.reported_ns != commands.reported_ns and reading.reported is not None:
                 commands.reported_ns = time_ns
@@ -81,8 +79,14 @@ class WheelCheck:
         if abs(before) - common > fall * 1.000001 + self._bit:
             said.append(("fall above limit", f"{name}: from {before:g} to {torque:g} N m, by at most {fall:g}"))
 
-    def _check_spread(self, name: str, spread: float, said: list[tuple[str, str]]) -> None:
-        limit = self.envelope.window_limit
+    def _check_spread(
+        self, time_ns: int, name: str, window: "Extremes", torque: float, said: list[tuple[str, str]]
+    ) -> None:
+        if not torque:
+            window.forget()  # the gate may go to zero from anywhere, and begins anew from there
+        window.add(time_ns, torque)
+        least, most = window.range(time_ns)
+        spread, limit = most - least, self.envelope.window_limit
         if spread > limit * 1.000001 + self._bit:
             said.append(("window above limit", f"{name}: {spread:g} N m apart within 250 ms, at most {limit:g}"))
 
@@ -127,23 +131,32 @@ def _mirrored(robot: RobotPlan) -> tuple[Observer, dict[int, int]]:
     return observer, dict.fromkeys(can_ids, robot.period_ns)
 
 
-class Window:
-    """What one wheel was asked for in a stretch of time, since it was last asked for nothing."""
+class Extremes:
+    """The smallest and the largest torque [N m] that one wheel was asked for in a stretch of time."""
 
     def __init__(self, length_ns: int) -> None:
         self._length_ns = length_ns
-        self._torques: deque[tuple[int, float]] = deque()
+        self._highs: deque[tuple[int, float]] = deque()  # each less than those before it
+        self._lows: deque[tuple[int, float]] = deque()  # likewise, negated
 
-    def spread(self, time_ns: int, torque: float) -> float:
-        """Takes a command [N m]; returns by how much the largest and the smallest differ."""
-        torques = self._torques
-        if not torque:
-            torques.clear()
-        torques.append((time_ns, torque))
-        while torques[0][0] < time_ns - self._length_ns:
-            torques.popleft()
-        values = [value for _, value in torques]
-        return max(values) - min(values)
+    def add(self, time_ns: int, torque: float) -> None:
+        """Takes a torque."""
+        for window, value in ((self._highs, torque), (self._lows, -torque)):
+            while window and window[-1][1] <= value:
+                window.pop()
+            window.append((time_ns, value))
+
+    def range(self, time_ns: int) -> tuple[float, float]:
+        """Returns both for the stretch that ends at a time; zeros if there was no torque in it."""
+        for window in (self._highs, self._lows):
+            while window and window[0][0] < time_ns - self._length_ns:
+                window.popleft()
+        return (-self._lows[0][1], self._highs[0][1]) if self._highs else (0.0, 0.0)
+
+    def forget(self) -> None:
+        """Begins anew."""
+        self._highs.clear()
+        self._lows.clear()
 
 
 class Commands:
@@ -153,22 +166,14 @@ class Commands:
         self.commanded_ns: int | None = None
         self.reported_ns: int | None = None
         self.torque: float | None = None
-        self._effect_ns = effect_ns
-        self._highs: deque[tuple[int, float]] = deque()  # each less than those before it
-        self._lows: deque[tuple[int, float]] = deque()  # likewise, negated
+        self._extremes = Extremes(effect_ns)
 
     def add(self, time_ns: int, torque: float) -> None:
         """Takes a command [N m]."""
         self.torque = torque
-        for window, value in ((self._highs, torque), (self._lows, -torque)):
-            while window and window[-1][1] <= value:
-                window.pop()
-            window.append((time_ns, value))
+        self._extremes.add(time_ns, torque)
 
     def range(self, time_ns: int) -> tuple[float, float]:
         """Returns the smallest and the largest torque that may still have an effect; zero always may."""
-        for window in (self._highs, self._lows):
-            while window and window[0][0] < time_ns - self._effect_ns:
-                window.popleft()
-        least = -self._lows[0][1] if self._lows else 0.0
-        return min(0.0, least), max(0.0, self._highs[0][1] if self._highs else 0.0)
+        least, most = self._extremes.range(time_ns)
+        return min(0.0, least), max(0.0, most)

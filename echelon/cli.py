@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from echelon import __version__
 
@@ -27,9 +27,16 @@ exit codes: 0 done and the verdict holds, 1 the verdict fails, 2 the input is wr
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that says a mistake in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
 def parser() -> argparse.ArgumentParser:
     """Returns the parser of all commands."""
-    top = argparse.ArgumentParser(
+    top = _Parser(
         prog="echelon",
         description="Groups of wheeled robots in formation: every robot its own process, wheel torques on a CAN bus.",
         epilog=EPILOG,

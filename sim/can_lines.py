@@ -6,7 +6,6 @@ from typing import Any, Final
 
 SHOWN: Final = 5
 """How many of many are listed."""
-_COUNTS: Final = {"lost": "lost", "destroyed and sent again": "destroyed"}
 
 
 def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
@@ -62,7 +61,8 @@ def stopped_by_reason(can: Mapping[str, Any]) -> Counter[str]:
 
 def _bus_counts(can: Mapping[str, Any]) -> dict[str, int]:
     buses = can.get("buses", ())
-    return {what: sum(bus[key] for bus in buses) for what, key in _COUNTS.items()}
+    lost, destroyed = (sum(bus[what] for bus in buses) for what in ("lost", "destroyed"))
+    return {"lost": lost, "destroyed and sent again": destroyed}
 
 
 def _some(texts: list[str]) -> str:

@@ -12,12 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from bridge.bus_load import frame_bits
-from bridge.frame import Frame
+from bridge.frame import WHEELS, Frame
 from bridge.observe import Finding, WheelReading
 from bridge.referee import Referee
 from echelon.plan import Plan, RobotPlan
 
-WHEELS: Final = ("right", "left")
 HALF: Final = 8
 """Cells of a bar on each side of zero"""
 BARS_FROM: Final = 110

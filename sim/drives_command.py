@@ -4,7 +4,6 @@ There are no robots: the wheels stand on a bench, each with the inertia and fric
 the scenario has for its drives happen, counted from the start.
 """
 
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ from bridge.bus_url import listen_command
 from bridge.drive_bank import DriveBank
 from echelon.drives import identifiers
 from echelon.plan import Plan, RobotPlan
+from sim.wall import RunClock
 from sim.wall_drives import WallDrives
 
 LINE_S: Final = 1.0
@@ -54,13 +54,13 @@ def run_drives(plan: Plan, urls: Sequence[str], seconds: float | None, say: Call
         drives = WallDrives(plan, buses)
         for line in describe(plan, [bus.url for bus in buses]):
             say(line)
-        start_ns = time.monotonic_ns()
+        clock = RunClock()
         end_s = float("inf") if seconds is None else seconds
         said_s = now_s = 0.0
         try:
             while now_s < end_s:
-                drives.serve(start_ns)
-                now_s = (time.monotonic_ns() - start_ns) / 1e9
+                drives.serve(clock)
+                now_s = clock.now() / 1e9
                 if now_s >= said_s + LINE_S:
                     said_s = now_s
                     say(line_of(plan, drives, buses, now_s))

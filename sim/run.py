@@ -215,7 +215,7 @@ def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
         drives = engine.roles[engine.plan.stations[1].index]
         assert isinstance(drives, DriveBank)
         result["drives"] = drives.result()
-        merge_rows(result["buses"], result["drives"].pop("buses"))
+        merge_rows(result["buses"], drives.lost_rows())
     return result
 
 

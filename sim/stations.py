@@ -38,7 +38,7 @@ class DrivesStation:
 
     def result(self) -> dict[str, Any]:
         """Returns what the drives saw."""
-        return self.role.result() | {"foreign": self.rail.foreign}
+        return self.role.result() | {"foreign": self.rail.foreign, "buses": self.role.lost_rows()}
 
     def close(self) -> None:
         """Closes the buses."""

@@ -69,9 +69,20 @@ def drained(bus: Bus) -> Iterator[Received]:
         yield received
 
 
-def epoch_ns_of(start_ns: int) -> int:
-    """Returns the instant since 1970 of an instant of the monotonic clock."""
-    return time.time_ns() - time.monotonic_ns() + start_ns
+class RunClock:
+    """Run time [ns] on a wall clock; 0 is at `start_ns` of the monotonic clock, now unless given."""
+
+    def __init__(self, start_ns: int | None = None) -> None:
+        self._start_ns = time.monotonic_ns() if start_ns is None else start_ns
+        self._epoch_ns = time.time_ns() - time.monotonic_ns() + self._start_ns
+
+    def now(self) -> int:
+        """Returns the run time."""
+        return time.monotonic_ns() - self._start_ns
+
+    def of(self, time_ns: int) -> int:
+        """Returns the run time of an instant since 1970, as the kernel stamps what it received."""
+        return time_ns - self._epoch_ns
 
 
 def wait_for(sources: Sequence[Any], left_ns: int) -> None:

@@ -4,7 +4,6 @@ It sleeps until a frame, a robot's torque or an instant of its own comes.  A tor
 a robot that says nothing in a period has its last torque sent again, until the envelope finds that too old.
 """
 
-import time
 from array import array
 from collections import deque
 from heapq import heappop, heappush
@@ -26,7 +25,7 @@ from echelon.plan import on_wall_clock
 from echelon.session import Session
 from echelon.wire import count_refusal, data_key, encode, join, watch_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
-from sim.wall import PROGRESS_NS, Mail, drained, epoch_ns_of, wait_for
+from sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
 
 FEEDBACK_SHARE: Final = 8
 """Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""
@@ -37,7 +36,7 @@ OTHER_NODE: Final = 1
 
 
 class WallBridge:
-    """The bridge on a wall clock.  Times are run time, which is 0 when the run starts, at `begin`."""
+    """The bridge on a wall clock.  Times are run time, by `clock`, which is set when the run starts."""
 
     def __init__(self, spec: ProcessSpec, session: Session) -> None:
         plan = on_wall_clock(spec.plan)
@@ -71,19 +70,11 @@ class WallBridge:
         """By bus and identifier: when torque frames were queued, and of which instant they are"""
         self.came = 0
         self.latencies = array("q")
-        self._start_ns = self._epoch_ns = 0
+        self.clock = RunClock()
         self.in_time = 0
         session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in plan.robots], self.mail.receive)
         self._wheels = session.publisher(data_key(spec.run, plan.stations[0].path, Channel.WHEELS))
         self._watch = session.publisher(watch_key(spec.run, "bridge", "bridge")) if spec.watched else None
-
-    def begin(self, start_ns: int) -> None:
-        """Takes note of when run time 0 is, on the monotonic clock."""
-        self._start_ns, self._epoch_ns = start_ns, epoch_ns_of(start_ns)
-
-    def now(self) -> int:
-        """Returns the run time."""
-        return time.monotonic_ns() - self._start_ns
 
     @property
     def due_ns(self) -> int:
@@ -103,7 +94,7 @@ class WallBridge:
     def torques(self) -> None:
         """Takes robots' torques as their links let them arrive, and sends them."""
         for message in self.mail.take():
-            now_ns = self.now()
+            now_ns = self.clock.now()
             if not self._plausible(now_ns, message):
                 count_refusal(self.mail.refused, "of another time")
                 continue
@@ -114,8 +105,8 @@ class WallBridge:
                 self._take(now_ns, message)
             else:
                 heappush(self._flying, (message.time_ns + delay_ns, message.source, message.sequence, message))
-        while self._flying and self._flying[0][0] <= self.now():
-            self._take(self.now(), heappop(self._flying)[-1])
+        while self._flying and self._flying[0][0] <= self.clock.now():
+            self._take(self.clock.now(), heappop(self._flying)[-1])
 
     def _plausible(self, now_ns: int, message: Message) -> bool:
         """Holds a message against the clock: it is of a period of this run that has begun, and not long over."""
@@ -135,7 +126,7 @@ class WallBridge:
         for number, bus in enumerate(self.station.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
-                came_ns = min(received.time_ns - self._epoch_ns, now_ns)  # as the kernel saw it
+                came_ns = min(self.clock.of(received.time_ns), now_ns)  # as the kernel saw it
                 self._buses[number].hear(now_ns, frame, came_ns)
                 if not self._role.buses[number].is_off(BRIDGE_NODE):
                     self._role.receive(now_ns, number, frame)
@@ -189,9 +180,8 @@ class WallBridge:
     def result(self) -> dict[str, Any]:
         """Returns what there is to say of the bridge; latencies [s] are from a robot's state to its torque frames."""
         result = self.station.result()
-        for row, load, paced in zip(result["buses"], self._loads(), self._buses, strict=True):
+        for row, load in zip(result["buses"], self._loads(), strict=True):
             row["load"] = load
-            row["lost"] += paced.expired
             if not self.plan.can.paced:
                 row["identifiers"] = {}  # how long its frames take the bus alone knows
         result["load_mean"] = max(row["load"] for row in result["buses"])
@@ -262,26 +252,25 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     except (ValueError, OSError) as error:
         raise StartError(str(error)) from None
     control.send(("bus", bridge.station.url))
-    start_ns = meet(spec, session, control)
-    bridge.begin(start_ns)
+    clock = bridge.clock = RunClock(meet(spec, session, control))
     said_ns = -1 << 62
     while True:
         # What drives say is of use when a period has ended; until then it can wait for the next torque.
         buses = bridge.station.buses if bridge.listens else ()
-        wait_for([control, bridge.mail, *buses], bridge.due_ns - bridge.now())
-        bridge.frames(bridge.now())
+        wait_for([control, bridge.mail, *buses], bridge.due_ns - clock.now())
+        bridge.frames(clock.now())
         bridge.torques()
-        bridge.carry(bridge.now())
-        bridge.pass_time(bridge.now())
-        now_ns = bridge.now()
+        bridge.carry(clock.now())
+        bridge.pass_time(clock.now())
+        now_ns = clock.now()
         if now_ns - said_ns >= PROGRESS_NS:
             said_ns = now_ns
             control.send(("progress", bridge.progress()))
         if control.poll():
             control.recv()
             break
-    bridge.frames(bridge.now())
-    bridge.stop(bridge.now())
+    bridge.frames(clock.now())
+    bridge.stop(clock.now())
     bridge.station.close()
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))

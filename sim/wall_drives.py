@@ -1,6 +1,5 @@
 """The virtual drives, and the referee, on a wall clock."""
 
-import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
@@ -19,7 +18,7 @@ from echelon.plan import Plan, on_wall_clock
 from echelon.session import Session
 from echelon.wire import data_key
 from sim.joining import ProcessSpec, Result, StartError, meet, resources
-from sim.wall import PROGRESS_NS, Mail, drained, epoch_ns_of, wait_for
+from sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
 
 
 def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) -> None:
@@ -31,16 +30,16 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
     drives = WallDrives(spec.plan, buses)
     mail = Mail(spec.plan, wakes=False)  # how shafts turn is early enough with the next frame
     session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in spec.plan.robots], mail.receive)
-    start_ns = meet(spec, session, control)
+    clock = RunClock(meet(spec, session, control))
     until_ns: int | None = None
-    while until_ns is None or time.monotonic_ns() < until_ns:
-        drives.serve(start_ns, [control])
+    while until_ns is None or clock.now() < until_ns:
+        drives.serve(clock, [control])
         for message in mail.take():
-            drives.bank.turn(time.monotonic_ns() - start_ns, message)
+            drives.bank.turn(clock.now(), message)
         if until_ns is None and control.poll():
             control.recv()
             # Until the drives stopped by themselves if nobody stopped them.
-            until_ns = time.monotonic_ns() + (2 * spec.plan.can.watchdog_ns if drives.bank.turning else 0)
+            until_ns = clock.now() + (2 * spec.plan.can.watchdog_ns if drives.bank.turning else 0)
     for bus in buses:
         bus.close()
     cpu_s, resident = resources()
@@ -56,18 +55,17 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -
         raise StartError(str(error)) from None
     # Processes wait for their turn; only what a drive's watchdog would notice, too, is late.
     referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
-    start_ns = meet(spec, session, control)
-    epoch_ns = epoch_ns_of(start_ns)
+    clock = RunClock(meet(spec, session, control))
     while True:
         wait_for([control, *buses], PROGRESS_NS)
         for number, bus in enumerate(buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
-                referee.observe(received.time_ns - epoch_ns, number, frame)
+                referee.observe(clock.of(received.time_ns), number, frame)
         if control.poll():
             control.recv()
             break
-    referee.finish(time.monotonic_ns() - start_ns)
+    referee.finish(clock.now())
     for bus in buses:
         bus.close()
     cpu_s, resident = resources()
@@ -77,7 +75,7 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -
 
 
 class WallDrives:
-    """The virtual drives of a plan on a wall clock, on all its buses.  Times are run time, `start_ns` when it is 0."""
+    """The virtual drives of a plan on a wall clock, on all its buses."""
 
     def __init__(self, plan: Plan, buses: Sequence[Bus]) -> None:
         self.plan = on_wall_clock(plan)
@@ -94,17 +92,16 @@ class WallDrives:
         due_ns = min(self.bank.due_ns, self._disturbances.due_ns)
         return min([due_ns, *(end_ns for bus in self._buses if (end_ns := bus.due_ns) is not None)])
 
-    def serve(self, start_ns: int, also: Sequence[Any] = ()) -> None:
+    def serve(self, clock: RunClock, also: Sequence[Any] = ()) -> None:
         """Waits for what comes next, a frame or an instant of their own, and lets the drives work; `also` ends the wait too."""
-        wait_for([*also, *(paced.bus for paced in self._buses)], self.due_ns - (time.monotonic_ns() - start_ns))
-        epoch_ns = epoch_ns_of(start_ns)
+        wait_for([*also, *(paced.bus for paced in self._buses)], self.due_ns - clock.now())
         for number, paced in enumerate(self._buses):
             for received in drained(paced.bus):
-                now_ns = time.monotonic_ns() - start_ns
+                now_ns = clock.now()
                 frame = Frame(received.can_id, received.data, received.remote)
-                paced.hear(now_ns, frame, received.time_ns - epoch_ns)
+                paced.hear(now_ns, frame, clock.of(received.time_ns))
                 self._send(self.bank.receive(now_ns, number, frame))
-        now_ns = time.monotonic_ns() - start_ns
+        now_ns = clock.now()
         self._send(self.bank.pass_time(now_ns))
         for paced in self._buses:
             paced.run(now_ns)
@@ -121,15 +118,12 @@ class WallDrives:
         """Returns what there is to say of them for a run's summary."""
         counts = [paced.bus.counts for paced in self._buses]
         result = self.bank.result() | {"failed": sum(count.failed + count.dropped for count in counts)}
-        del result["buses"]  # here frames are lost on the way out
         if self.plan.can.paced:
             fit = plan_fit(self.plan)
             result["buses"] = [
                 bus_row(self.plan, number, paced.model, fit[number].responses_ns)
                 for number, paced in enumerate(self._buses)
             ]
-            for row, paced in zip(result["buses"], self._buses, strict=True):
-                row["lost"] += paced.expired
         return result
 
     def lost_and_destroyed(self) -> tuple[int, int]:

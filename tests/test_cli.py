@@ -120,6 +120,10 @@ def test_plain_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
         (("export", "no-such-run", "--csv", "x"), "no-such-run"),
         (("recover", "no-such-file"), "no-such-file"),
         (("dbc", "nosuch"), "nosuch"),
+        (("run", "lab", "--set", "can.path=closed", "--can", "none"), "--can none: the closed torque path"),
+        (("run", "lab", "--set", "can.timing=bits"), "can.timing = 'bits': needs can.path = 'closed'"),
+        (("run", "lab", "--stall-timeout", "-1"), "'-1' is no duration in seconds"),
+        (("drives", "lab", "--seconds", "nan"), "'nan' is no duration in seconds"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments: tuple[str, ...], says: str) -> None:

@@ -231,6 +231,21 @@ def test_where_no_drive_answers_the_bridge_says_so_and_goes_on(tmp_path: Path, p
     assert "lost bridge" not in done.stdout + done.stderr
     robots = summary_of(tmp_path / "run")["can"]["robots"]
     assert not any(row["enabled"] for row in robots.values())
+    assert "not enabled at the end: g1/r1, " in done.stdout
+
+
+@pytest.mark.parametrize("engine", ["inprocess", "processes"])
+def test_frames_that_drives_had_no_room_for_stand_with_their_identifiers(tmp_path: Path, engine: str) -> None:
+    sets = ["can.path=closed", "can.bitrate=125000", "can.queue=8", "duration=0.5", "claims=[]"]
+    arguments = [word for value in sets for word in ("--set", value)]
+    echelon("run", "lab", "--engine", engine, "--quiet", "--no-report", "--out", tmp_path / "run", *arguments)
+    can = summary_of(tmp_path / "run")["can"]
+    (bus,) = can["buses"]
+    in_drives = sum(row["lost"] for row in can["drives"]["robots"].values())
+    assert in_drives > 100
+    assert bus["lost"] >= in_drives
+    assert bus["lost"] == sum(row["lost"] for row in bus["identifiers"].values())
+    assert all(bus["identifiers"][f"{0x200 + robot:03X}"]["lost"] for robot in range(ROBOTS))
 
 
 @pytest.mark.parametrize("command", ["run", "drives"])

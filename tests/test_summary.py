@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from synthetic import DECAY, FIELD, at_places, decaying, link_counts, of_states, with_states
 
+from sim.can_lines import can_lines, can_reasons
 from sim.distances import distances
 from sim.measures import settling_ns
 from sim.summary import summarise, summary_text, write
@@ -288,3 +289,18 @@ def test_the_text_says_what_matters(summary):
     for words in ("intra within 5 % by 0.1 s: 0.06 s, holds", "2 lost", "0.006 s", "2 times real time"):
         assert words in text
     assert summary["trace_digest"] in text
+
+
+def test_what_was_on_schedule_and_who_went_bus_off_is_told():
+    buses = [
+        {"lost": 3, "destroyed": 2, "events": [{"time": 2.5, "node": 0, "who": "bridge", "event": "bus-off"}]},
+        {"lost": 1, "destroyed": 0, "events": [{"time": 2.6, "node": 0, "who": "bridge", "event": "recovered"}]},
+    ]
+    scheduled = [{"time": 2.0, "until": None, "what": "estop", "whom": ["g1/r1"]}]
+    finding = {"time": 2.5, "bus": "can0", "id": "100", "kind": "gap", "text": "late", "robot": "g1/r1"}
+    referee = {"frames": 7, "kinds": {"gap": 1}, "findings": [finding]}
+    can = {"frames": 7, "path": "closed", "buses": buses, "scheduled": scheduled, "referee": referee}
+    lines = [" ".join(line.split()) for line in can_lines(can)]
+    assert lines[0].startswith("CAN 7 frames, 4 lost, 2 destroyed and sent again")
+    assert lines[1:3] == ["events 2 s estop", "bus-off bridge at 2.5 s"]
+    assert can_reasons(can) == ["referee: 1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"]

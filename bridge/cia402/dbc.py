@@ -29,7 +29,7 @@ from bridge.cia402.codec import (
     rated_mnm,
 )
 from bridge.cia402.configuration import heartbeat_ns
-from bridge.cia402.host import WHEELS
+from bridge.frame import WHEELS
 from echelon.can_plan import DrivePlan
 
 Choices = OrderedDict[int, str | NamedSignalValue]

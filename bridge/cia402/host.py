@@ -5,7 +5,6 @@ Each drive is brought up by itself, one SDO request per `poll` (bridge.cia402.wh
 
 import math
 from collections import Counter
-from typing import Final
 
 from bridge.cia402.codec import (
     EMCY_ID,
@@ -20,10 +19,8 @@ from bridge.cia402.codec import (
 )
 from bridge.cia402.configuration import heartbeat_ns
 from bridge.cia402.wheel import Wheel
-from bridge.frame import Frame
+from bridge.frame import WHEELS, Frame
 from echelon.can_plan import DrivePlan
-
-WHEELS: Final = ("right", "left")
 
 
 class Master:

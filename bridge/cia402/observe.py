@@ -32,10 +32,9 @@ from bridge.cia402.codec import (
     state_of,
 )
 from bridge.cia402.configuration import heartbeat_ns
-from bridge.cia402.host import WHEELS
 from bridge.cia402.objects import CONTROLWORD, TARGET_TORQUE
 from bridge.cia402.sdo import LENGTH, written
-from bridge.frame import Frame
+from bridge.frame import WHEELS, Frame
 from bridge.observe import Finding, WheelReading
 from echelon.can_plan import DrivePlan, EnvelopePlan
 

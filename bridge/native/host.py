@@ -6,7 +6,7 @@ Pure: frames and the time in, frames out.  One command per cycle, whatever it sa
 from collections import Counter
 from typing import Final
 
-from bridge.frame import Frame, recovers_after_ns
+from bridge.frame import WHEELS, Frame, recovers_after_ns
 from bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
@@ -25,7 +25,6 @@ from echelon.can_plan import NEVER_NS, DrivePlan
 SILENT: Final = "silent"
 REMOTE: Final = "remote"
 REPEATED: Final = "counter repeated"
-WHEELS: Final = ("right", "left")
 _DISABLED: Final = (WheelState.DISABLED, WheelState.DISABLED)
 _ENABLED: Final = (WheelState.ENABLED, WheelState.ENABLED)
 

@@ -1,8 +1,6 @@
 """A passive listener to the native frames of one robot: what they say, and what must not be.  Pure."""
 
-from typing import Final
-
-from bridge.frame import Frame
+from bridge.frame import WHEELS, Frame
 from bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
@@ -20,8 +18,6 @@ from bridge.native.codec import (
 from bridge.native.counter import CounterCheck
 from bridge.observe import Finding, WheelReading
 from echelon.can_plan import DrivePlan, EnvelopePlan
-
-WHEELS: Final = ("right", "left")
 
 
 class NativeObserver:

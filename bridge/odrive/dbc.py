@@ -7,6 +7,7 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
+from bridge.frame import WHEELS
 from bridge.odrive.codec import MESSAGES, frame_id
 from bridge.odrive.codec import Message as Layout
 from bridge.odrive.config import ODriveConfig
@@ -15,7 +16,6 @@ from echelon.can_plan import DrivePlan
 
 HOST = "bridge"
 """Who sends commands"""
-_WHEELS = ("right", "left")
 
 
 def messages(plan: DrivePlan, robot_name: str, config: ODriveConfig | None = None) -> list[Message]:
@@ -25,7 +25,7 @@ def messages(plan: DrivePlan, robot_name: str, config: ODriveConfig | None = Non
     robot = re.sub(r"\W", "_", robot_name, flags=re.ASCII)
     periods_ns = {**(config or ODriveConfig()).periods_ns(plan), Command.SET_INPUT_TORQUE: plan.period_ns}
     found = []
-    for node, wheel in zip(plan.node_ids, _WHEELS, strict=True):
+    for node, wheel in zip(plan.node_ids, WHEELS, strict=True):
         drive = f"drive_{robot}_{wheel}"
         for command, layout in MESSAGES.items():
             period_ns = periods_ns.get(layout.command)

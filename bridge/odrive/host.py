@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
-from bridge.frame import Frame, recovers_after_ns
+from bridge.frame import WHEELS, Frame, recovers_after_ns
 from bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
 from bridge.odrive.enums import AxisState, Command, ControlMode, InputMode, error_names
 from echelon.can_plan import DrivePlan
@@ -26,7 +26,6 @@ SETTLE_NS: Final = 50_000_000
 first, and the axis close its loop in another mode"""
 SILENT: Final = "silent"
 NO_TORQUE: Final = "gives no torque"
-_WHEELS: Final = ("right", "left")
 _HEARD: Final = (Command.HEARTBEAT, Command.GET_ERROR, Command.GET_ENCODER_ESTIMATES, Command.GET_TORQUES)
 _TORQUE: Final = MESSAGES[Command.SET_INPUT_TORQUE]
 
@@ -115,9 +114,7 @@ class ODriveHost:
     @property
     def fault(self) -> str:
         """What a drive reports to be wrong, in words; empty if nothing is."""
-        return "; ".join(
-            f"{wheel}: {axis.fault}" for wheel, axis in zip(_WHEELS, self._axes, strict=True) if axis.fault
-        )
+        return "; ".join(f"{wheel}: {axis.fault}" for wheel, axis in zip(WHEELS, self._axes, strict=True) if axis.fault)
 
     @property
     def torque(self) -> tuple[float, float]:

@@ -10,8 +10,8 @@ from math import nan
 
 import numpy as np
 
-from agents.plant import LOST, make_step, state_at
-from agents.torque import TorqueLimits, make_inverse
+from echelon.agents.plant import LOST, make_step, state_at
+from echelon.agents.torque import TorqueLimits, make_inverse
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Stage

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import cos, sin
 
-from agents.plant import RobotState
+from echelon.agents.plant import RobotState
 from echelon.plan import RobotPlan
 
 Inverse = Callable[[RobotState, float, float, float], tuple[float, float]]

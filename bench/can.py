@@ -20,17 +20,17 @@ import can
 import numpy as np
 
 from bench.product import Row, table
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import resolve_url
-from bridge.commander import Torques
-from bridge.frame import Frame
-from bridge.protocols import drive_places, make_drive
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import resolve_url
+from echelon.bridge.commander import Torques
+from echelon.bridge.frame import Frame
+from echelon.bridge.protocols import drive_places, make_drive
 from echelon.load import effective_toml, load
 from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan import Plan
-from sim.engine import Engine
-from sim.supervisor import Supervisor
-from sim.usage import SCENARIOS
+from echelon.sim.engine import Engine
+from echelon.sim.supervisor import Supervisor
+from echelon.sim.usage import SCENARIOS
 
 CYCLES: Final = 500
 """Of nine frames each."""

@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.bus_url import resolve_url
+from echelon.bridge.bus_url import resolve_url
 from echelon.load import effective_toml, load
-from sim.engine import Engine
-from sim.live import Display
-from sim.run import execute
-from sim.supervisor import Supervisor
-from sim.usage import SCENARIOS
+from echelon.sim.engine import Engine
+from echelon.sim.live import Display
+from echelon.sim.run import execute
+from echelon.sim.supervisor import Supervisor
+from echelon.sim.usage import SCENARIOS
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from bridge.bus_load import BitCount
-from bridge.envelope import Envelope
-from bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
+from echelon.bridge.bus_load import BitCount
+from echelon.bridge.envelope import Envelope
+from echelon.bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
 from echelon.can_plan import EnvelopePlan
 
 Frame = tuple[int, bytes]

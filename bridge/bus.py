@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, Self
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from bridge.bus_url import Address, parse
-from bridge.wires import Datagrams, RawCan, Wire, enlarge_buffers
+from echelon.bridge.bus_url import Address, parse
+from echelon.bridge.wires import Datagrams, RawCan, Wire, enlarge_buffers
 
 _STAMP = struct.Struct("@ll")  # struct timespec, what SO_TIMESTAMPNS gives
 _STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, Protocol
 
-from bridge.frame import Frame
+from echelon.bridge.frame import Frame
 
 
 class Delivered(NamedTuple):

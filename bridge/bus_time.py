@@ -26,10 +26,10 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
-from bridge.bus_load import frame_bits
-from bridge.bus_model import BusEvent, BusEventKind, BusModel, Delivered, Traffic
-from bridge.error_draws import INTERFRAME, ErrorDraws
-from bridge.frame import Frame
+from echelon.bridge.bus_load import frame_bits
+from echelon.bridge.bus_model import BusEvent, BusEventKind, BusModel, Delivered, Traffic
+from echelon.bridge.error_draws import INTERFRAME, ErrorDraws
+from echelon.bridge.frame import Frame
 
 CAPACITY = 64
 """Frames that a node holds unless told otherwise (SocketCAN's own default is 10)"""

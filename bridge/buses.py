@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bridge.bus_model import BusModel, Traffic
-from bridge.bus_time import BusTime
-from bridge.frame import WHEELS
-from bridge.frame_message import BRIDGE_NODE
-from bridge.ideal_bus import IdealBus
-from bridge.protocols import DrivePlace, drive_places
+from echelon.bridge.bus_model import BusModel, Traffic
+from echelon.bridge.bus_time import BusTime
+from echelon.bridge.frame import WHEELS
+from echelon.bridge.frame_message import BRIDGE_NODE
+from echelon.bridge.ideal_bus import IdealBus
+from echelon.bridge.protocols import DrivePlace, drive_places
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from bridge.frame import Frame
+from echelon.bridge.frame import Frame
 
 FLUSH_NS = 100_000_000  # what a killed process may lose, at most twice this while frames come
 _MAX_LINES = 4096

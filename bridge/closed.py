@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import listen_command
-from bridge.buses import bus_row, scheduled
-from bridge.canlog import CanLog
-from bridge.commander import Commander
-from bridge.fit import plan_fit
-from bridge.frame_message import BRIDGE_NODE, TimedFrame
-from bridge.on_bus import Rail, on_bus
-from bridge.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import listen_command
+from echelon.bridge.buses import bus_row, scheduled
+from echelon.bridge.canlog import CanLog
+from echelon.bridge.commander import Commander
+from echelon.bridge.fit import plan_fit
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame
+from echelon.bridge.on_bus import Rail, on_bus
+from echelon.bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.plan import Plan
 from echelon.role import Stage
 

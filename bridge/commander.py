@@ -14,18 +14,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from bridge.bus_load import worst_case_bits
-from bridge.bus_model import BusEventKind
-from bridge.bus_time import BusTime
-from bridge.buses import make_buses
-from bridge.cia402.host import Master
-from bridge.disturbances import Disturbances
-from bridge.envelope import Envelope
-from bridge.frame import Frame, Host
-from bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
-from bridge.ideal_bus import IdealBus
-from bridge.protocols import drive_places, make_host
-from bridge.schedule import Schedule
+from echelon.bridge.bus_load import worst_case_bits
+from echelon.bridge.bus_model import BusEventKind
+from echelon.bridge.bus_time import BusTime
+from echelon.bridge.buses import make_buses
+from echelon.bridge.cia402.host import Master
+from echelon.bridge.disturbances import Disturbances
+from echelon.bridge.envelope import Envelope
+from echelon.bridge.frame import Frame, Host
+from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
+from echelon.bridge.ideal_bus import IdealBus
+from echelon.bridge.protocols import drive_places, make_host
+from echelon.bridge.schedule import Schedule
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage

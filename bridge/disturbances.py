@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from bridge.bus_model import BusModel
-from bridge.frame_message import BRIDGE_NODE
-from bridge.protocols import drive_places
-from bridge.schedule import Schedule
+from echelon.bridge.bus_model import BusModel
+from echelon.bridge.frame_message import BRIDGE_NODE
+from echelon.bridge.protocols import drive_places
+from echelon.bridge.schedule import Schedule
 from echelon.can_plan import DISTURBANCES, NEVER_NS
 from echelon.plan import Plan
 

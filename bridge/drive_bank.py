@@ -9,12 +9,12 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
-from bridge.buses import lost_row
-from bridge.frame import Drive, Frame
-from bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
-from bridge.motor import Fault
-from bridge.protocols import DrivePlace, drive_places, make_drive
-from bridge.schedule import Schedule
+from echelon.bridge.buses import lost_row
+from echelon.bridge.frame import Drive, Frame
+from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
+from echelon.bridge.motor import Fault
+from echelon.bridge.protocols import DrivePlace, drive_places, make_drive
+from echelon.bridge.schedule import Schedule
 from echelon.can_plan import NEVER_NS
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan

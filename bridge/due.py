@@ -18,10 +18,10 @@ anew.
 from math import ceil
 from typing import Final
 
-from bridge.bus_load import worst_case_bits
-from bridge.cia402.codec import HEARTBEAT_ID, TPDO_IDS
-from bridge.frame import Frame
-from bridge.wheel_check import WheelCheck
+from echelon.bridge.bus_load import worst_case_bits
+from echelon.bridge.cia402.codec import HEARTBEAT_ID, TPDO_IDS
+from echelon.bridge.frame import Frame
+from echelon.bridge.wheel_check import WheelCheck
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
 

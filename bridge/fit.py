@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bridge.bus_load import worst_case_bits
-from bridge.cia402.codec import SYNC_ID
-from bridge.protocols import dbc_messages, make_observer, shared_cyclic
-from bridge.response_time import Stream, advice, fits, load, response_times
+from echelon.bridge.bus_load import worst_case_bits
+from echelon.bridge.cia402.codec import SYNC_ID
+from echelon.bridge.protocols import dbc_messages, make_observer, shared_cyclic
+from echelon.bridge.response_time import Stream, advice, fits, load, response_times
 from echelon.plan import Plan
 
 

@@ -7,7 +7,7 @@ What comes from the bus is checked, counted in `refused`, and dropped; it never 
 from collections import Counter
 from typing import Final, NamedTuple, Protocol
 
-from bridge.motor import Fault, Motor
+from echelon.bridge.motor import Fault, Motor
 from echelon.can_plan import DrivePlan
 
 WHEELS: Final = ("right", "left")

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bridge.frame import Frame
+from echelon.bridge.frame import Frame
 from echelon.messages import Message, Values
 
 BRIDGE_NODE: Final = 0

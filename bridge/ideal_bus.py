@@ -3,9 +3,9 @@
 from collections import defaultdict
 from collections.abc import Mapping
 
-from bridge.bus_load import check_frame
-from bridge.bus_model import BusEvent, BusModel, Delivered, Traffic
-from bridge.frame import Frame
+from echelon.bridge.bus_load import check_frame
+from echelon.bridge.bus_model import BusEvent, BusModel, Delivered, Traffic
+from echelon.bridge.frame import Frame
 
 _EVER = -(2**62)
 

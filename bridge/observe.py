@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from bridge.frame import Frame
+from echelon.bridge.frame import Frame
 
 
 class Finding(NamedTuple):

@@ -7,9 +7,9 @@ others; what finds no room is lost; error frames and bus-off happen in the model
 frames go out at once: a real bus takes its own time.
 """
 
-from bridge.bus import Bus
-from bridge.bus_model import BusEventKind, BusModel, Delivered
-from bridge.frame import Frame
+from echelon.bridge.bus import Bus
+from echelon.bridge.bus_model import BusEventKind, BusModel, Delivered
+from echelon.bridge.frame import Frame
 
 
 class PacedBus:

@@ -7,8 +7,8 @@ from typing import Any
 from cantools.database import Database
 from cantools.database.can import Node
 
-from bridge.native.dbc import KINDS
-from bridge.protocols import dbc_messages
+from echelon.bridge.native.dbc import KINDS
+from echelon.bridge.protocols import dbc_messages
 from echelon.plan import Plan
 
 _LONGEST = 32 - len("_") - max(map(len, KINDS))  # a DBC identifier has at most 32 characters

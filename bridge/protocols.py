@@ -4,10 +4,10 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final, NamedTuple
 
-from bridge.cia402.codec import HEARTBEAT_ID, HOST_NODE, SYNC_ID
-from bridge.cia402.configuration import heartbeat_ns
-from bridge.frame import Drive, Host
-from bridge.observe import Observer
+from echelon.bridge.cia402.codec import HEARTBEAT_ID, HOST_NODE, SYNC_ID
+from echelon.bridge.cia402.configuration import heartbeat_ns
+from echelon.bridge.frame import Drive, Host
+from echelon.bridge.observe import Observer
 from echelon.can_plan import DrivePlan
 from echelon.plan import Plan, RobotPlan
 
@@ -16,7 +16,7 @@ PREFIX: Final = {"native": "Native", "odrive": "ODrive", "cia402": "Cia402"}
 
 
 def _part(protocol: str, module: str, kind: str) -> Any:
-    return getattr(import_module(f"bridge.{protocol}.{module}"), PREFIX[protocol] + kind)
+    return getattr(import_module(f"echelon.bridge.{protocol}.{module}"), PREFIX[protocol] + kind)
 
 
 class DrivePlace(NamedTuple):
@@ -73,13 +73,13 @@ def torque_frames(robot: RobotPlan) -> Callable[[float, float], list[tuple[int, 
     alone, as the mirrored path shows them."""
     motor, (right, left) = robot.drive.motor, robot.drive.node_ids
     if robot.drive.protocol == "odrive":
-        from bridge.odrive.codec import MESSAGES, frame_id
-        from bridge.odrive.enums import Command
+        from echelon.bridge.odrive.codec import MESSAGES, frame_id
+        from echelon.bridge.odrive.enums import Command
 
         torque, command = MESSAGES[Command.SET_INPUT_TORQUE], Command.SET_INPUT_TORQUE
         ids = frame_id(right, command), frame_id(left, command)
         return lambda *taus: [(can_id, torque.encode(tau)) for can_id, tau in zip(ids, taus, strict=True)]
-    from bridge.cia402.codec import RPDO2, RPDO_IDS, permille, rated_mnm
+    from echelon.bridge.cia402.codec import RPDO2, RPDO_IDS, permille, rated_mnm
 
     rated = rated_mnm(motor.rated_torque)
     ids = RPDO_IDS[1] + right, RPDO_IDS[1] + left
@@ -88,6 +88,6 @@ def torque_frames(robot: RobotPlan) -> Callable[[float, float], list[tuple[int, 
 
 def dbc_messages(drive: DrivePlan, robot: str, number: int) -> list[Any]:
     """Returns the DBC messages of a robot's drives."""
-    make = import_module(f"bridge.{drive.protocol}.dbc").messages
+    make = import_module(f"echelon.bridge.{drive.protocol}.dbc").messages
     found: list[Any] = make(drive, robot, number) if drive.protocol == "native" else make(drive, robot)
     return found

@@ -26,12 +26,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.canlog import read_log
-from bridge.due import Lane
-from bridge.frame import Frame
-from bridge.observe import Finding, Observer
-from bridge.protocols import shared_cyclic
-from bridge.wheel_check import WheelCheck
+from echelon.bridge.canlog import read_log
+from echelon.bridge.due import Lane
+from echelon.bridge.frame import Frame
+from echelon.bridge.observe import Finding, Observer
+from echelon.bridge.protocols import shared_cyclic
+from echelon.bridge.wheel_check import WheelCheck
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
 

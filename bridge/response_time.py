@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import accumulate, chain
 
-from bridge.bus_load import worst_case_bits
+from echelon.bridge.bus_load import worst_case_bits
 
 BITRATES = (125_000, 250_000, 500_000, 800_000, 1_000_000)
 """What classic CAN controllers usually offer [bit/s]"""

@@ -7,15 +7,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from bridge.bridge import Bridge
-from bridge.bus import open_bus
-from bridge.bus_load import bus_load
-from bridge.bus_url import listen_command
-from bridge.canlog import CanLog
-from bridge.fit import plan_fit
-from bridge.frame_message import BRIDGE_NODE, add_words
-from bridge.plan_dbc import dbc_names, plan_dbc
-from bridge.protocols import torque_frames
+from echelon.bridge.bridge import Bridge
+from echelon.bridge.bus import open_bus
+from echelon.bridge.bus_load import bus_load
+from echelon.bridge.bus_url import listen_command
+from echelon.bridge.canlog import CanLog
+from echelon.bridge.fit import plan_fit
+from echelon.bridge.frame_message import BRIDGE_NODE, add_words
+from echelon.bridge.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.protocols import torque_frames
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 

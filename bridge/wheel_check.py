@@ -7,15 +7,15 @@ from collections import deque
 from math import inf
 from typing import Final
 
-from bridge.cia402.codec import RPDO_IDS
-from bridge.frame import WHEELS
-from bridge.native.codec import BASE_ID
-from bridge.observe import Observer
-from bridge.odrive.codec import frame_id
-from bridge.odrive.config import ODriveConfig
-from bridge.odrive.enums import Command
-from bridge.odrive.observe import ODriveObserver
-from bridge.protocols import make_observer
+from echelon.bridge.cia402.codec import RPDO_IDS
+from echelon.bridge.frame import WHEELS
+from echelon.bridge.native.codec import BASE_ID
+from echelon.bridge.observe import Observer
+from echelon.bridge.odrive.codec import frame_id
+from echelon.bridge.odrive.config import ODriveConfig
+from echelon.bridge.odrive.enums import Command
+from echelon.bridge.odrive.observe import ODriveObserver
+from echelon.bridge.protocols import make_observer
 from echelon.plan import Plan, RobotPlan
 
 _WINDOW_NS: Final = 250_000_000

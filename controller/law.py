@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.potential import PairForces, pairs_between
-from controller.trajectory import make_trajectory
-from controller.transformation import Transformation
+from echelon.controller.potential import PairForces, pairs_between
+from echelon.controller.trajectory import make_trajectory
+from echelon.controller.transformation import Transformation
 from echelon.plan import Array, BlockPlan, Plan
 
 

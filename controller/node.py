@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.law import BlockGains
-from controller.potential import PairForces, pairs_between
-from controller.trajectory import make_trajectory
-from controller.transformation import desired_shape, node_matrix
+from echelon.controller.law import BlockGains
+from echelon.controller.potential import PairForces, pairs_between
+from echelon.controller.trajectory import make_trajectory
+from echelon.controller.transformation import desired_shape, node_matrix
 from echelon.messages import NULL, Channel, Heard, Message, Values
 from echelon.plan import Array, NodePlan, Plan
 from echelon.role import Input, Stage

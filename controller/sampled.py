@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import block_diag, eigvals
 from scipy.sparse.csgraph import connected_components
 
-from controller.law import BlockGains
+from echelon.controller.law import BlockGains
 from echelon.plan import Array, Plan
 
 

@@ -11,7 +11,7 @@ from typing import Final, NoReturn
 
 from echelon import __version__
 
-COMMANDS: Final = "sim.commands"
+COMMANDS: Final = "echelon.sim.commands"
 """The module with one function per command."""
 
 EPILOG: Final = """\

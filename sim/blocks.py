@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.trajectory import make_trajectory, sample
-from controller.transformation import Transformation
+from echelon.controller.trajectory import make_trajectory, sample
+from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan import BlockPlan
-from sim.trace import Trace
+from echelon.sim.trace import Trace
 
 Array = NDArray[np.float64]
 POSITION = field_index(STATE_FIELDS, "x", "y")

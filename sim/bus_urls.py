@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from bridge.bus_url import interface_is_up, resolve_url
+from echelon.bridge.bus_url import interface_is_up, resolve_url
 from echelon.can_plan import DISTURBANCES
 from echelon.plan import Plan
-from sim.usage import UsageError
+from echelon.sim.usage import UsageError
 
 
 def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:

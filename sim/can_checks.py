@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.bus import open_bus
-from bridge.bus_url import interface_is_up, resolve_url
+from echelon.bridge.bus import open_bus
+from echelon.bridge.bus_url import interface_is_up, resolve_url
 from echelon.plan import Plan
-from sim.finding import LIMIT_S, Finding
+from echelon.sim.finding import LIMIT_S, Finding
 
 SHORT_QUEUE: Final = 100
 NET: Final = Path("/sys/class/net")
@@ -129,7 +129,7 @@ def check_tools() -> Finding:
 
 def check_fit(plan: Plan) -> list[Finding]:
     """Whether the plan's frames fit its buses."""
-    from bridge.fit import plan_fit
+    from echelon.bridge.fit import plan_fit
 
     findings = []
     for fit in plan_fit(plan):

@@ -13,15 +13,15 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import interface_is_up, resolve_url
-from bridge.closed import LOG
-from bridge.frame import Frame
-from bridge.referee import Referee, judge_log, read_run_log
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import interface_is_up, resolve_url
+from echelon.bridge.closed import LOG
+from echelon.bridge.frame import Frame
+from echelon.bridge.referee import Referee, judge_log, read_run_log
 from echelon.load import ScenarioError, parse
 from echelon.plan import Plan
-from sim.can_table import CanTable, finding_text
-from sim.usage import UsageError, scenario_of
+from echelon.sim.can_table import CanTable, finding_text
+from echelon.sim.usage import UsageError, scenario_of
 
 TICK_S: Final = 0.1
 """Listening looks up so often though nothing comes"""

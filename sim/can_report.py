@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from sim.can_lines import stopped_by_reason
-from sim.page import paragraph, subheading, table
-from sim.summary import number
+from echelon.sim.can_lines import stopped_by_reason
+from echelon.sim.page import paragraph, subheading, table
+from echelon.sim.summary import number
 
 MAX_ROWS: Final = 60
 """Rows of a table; what is beyond is in summary.json."""

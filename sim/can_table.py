@@ -11,10 +11,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from bridge.bus_load import frame_bits
-from bridge.frame import WHEELS, Frame
-from bridge.observe import Finding, WheelReading
-from bridge.referee import Referee
+from echelon.bridge.bus_load import frame_bits
+from echelon.bridge.frame import WHEELS, Frame
+from echelon.bridge.observe import Finding, WheelReading
+from echelon.bridge.referee import Referee
 from echelon.plan import Plan, RobotPlan
 
 HALF: Final = 8

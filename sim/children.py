@@ -3,22 +3,25 @@ say, how they ended."""
 
 import os
 import signal
+import sys
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 from echelon.plan import Plan, RobotPlan
 from echelon.session import loopback_endpoints
-from sim.joining import ProcessSpec, Result
-from sim.process import main
+from echelon.sim.joining import ProcessSpec, Result
+from echelon.sim.process import main
 
-PRELOAD: Final = ["sim.process"]
+PRELOAD: Final = ["echelon.sim.process"]
 LAST_WORDS: Final = 4000
 """Bytes kept of what a process says on standard error."""
 FINISHING: Final = ("bridge", "drives", "referee", "recorder")
@@ -88,13 +91,32 @@ def warm_up() -> None:
     context.set_forkserver_preload(PRELOAD)
     from multiprocessing import forkserver, resource_tracker
 
-    resource_tracker.ensure_running()  # which changes the mask when it starts
+    with _on_its_own():
+        resource_tracker.ensure_running()  # which changes the mask when it starts
     # Ctrl-C reaches the whole terminal: it is for this process alone, and not for one that is just importing.
     unmasked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        forkserver.ensure_running()
+        with _on_its_own():
+            forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, unmasked)
+
+
+@contextmanager
+def _on_its_own() -> Iterator[None]:
+    """Starts processes that see no module of the working folder (a user's `numpy.py` there is not numpy), and that do not
+    run the calling script again: it needs no `if __name__ == "__main__":`, and may come from standard input."""
+    script, safe_path = sys.modules["__main__"], os.environ.get("PYTHONSAFEPATH")
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+        if safe_path is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = safe_path
 
 
 def start(spec: ProcessSpec) -> Child:
@@ -104,7 +126,8 @@ def start(spec: ProcessSpec) -> Child:
     control, child_control = context.Pipe()
     words, child_words = context.Pipe(duplex=False)
     process = context.Process(target=main, args=(spec, child_control, child_words), name=spec.name, daemon=True)
-    process.start()
+    with _on_its_own():
+        process.start()
     child_control.close()
     child_words.close()
     os.set_blocking(words.fileno(), False)

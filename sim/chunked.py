@@ -32,7 +32,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from sim import ros
+from echelon.sim import ros
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "echelon"

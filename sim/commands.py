@@ -9,19 +9,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sim.usage import UsageError, scenario_of
+from echelon.sim.usage import UsageError, scenario_of
 
 
 def run(arguments: argparse.Namespace) -> int:
     """`echelon run`"""
-    from sim.run_command import run as work
+    from echelon.sim.run_command import run as work
 
     return work(arguments)
 
 
 def validate(arguments: argparse.Namespace) -> int:
     """`echelon validate`"""
-    from bridge.fit import describe_fit
+    from echelon.bridge.fit import describe_fit
 
     scenario, plan = scenario_of(arguments)
     facts: dict[str, Any] = {
@@ -50,7 +50,7 @@ def report(arguments: argparse.Namespace) -> int:
     """`echelon report`"""
     folders = [Path(run) for run in arguments.runs]
     path = arguments.out or (folders[0] / "report.html" if len(folders) == 1 else Path("report.html"))
-    from sim.run_folder import report_on
+    from echelon.sim.run_folder import report_on
 
     try:
         report_on(folders, path)
@@ -62,9 +62,9 @@ def report(arguments: argparse.Namespace) -> int:
 
 def export(arguments: argparse.Namespace) -> int:
     """`echelon export`"""
-    from sim.export import export_csv
-    from sim.recording import read_links
-    from sim.run_folder import read_run
+    from echelon.sim.export import export_csv
+    from echelon.sim.recording import read_links
+    from echelon.sim.run_folder import read_run
 
     folder = Path(arguments.run)
     run_read = read_run(folder)
@@ -79,7 +79,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 def recover(arguments: argparse.Namespace) -> int:
     """`echelon recover`"""
-    from sim.recording import recover as mend
+    from echelon.sim.recording import recover as mend
 
     target = arguments.out or arguments.file.with_name(arguments.file.stem + "-recovered.mcap")
     try:
@@ -94,7 +94,7 @@ def recover(arguments: argparse.Namespace) -> int:
 
 def dbc(arguments: argparse.Namespace) -> int:
     """`echelon dbc`"""
-    from bridge.plan_dbc import plan_dbc
+    from echelon.bridge.plan_dbc import plan_dbc
 
     _, plan = scenario_of(arguments)
     names = [bus.name for bus in plan.can.buses]
@@ -110,8 +110,8 @@ def dbc(arguments: argparse.Namespace) -> int:
 
 def drives(arguments: argparse.Namespace) -> int:
     """`echelon drives`"""
-    from sim.bus_urls import bus_urls, check_wall_clock
-    from sim.drives_command import run_drives
+    from echelon.sim.bus_urls import bus_urls, check_wall_clock
+    from echelon.sim.drives_command import run_drives
 
     arguments.set = [*(arguments.set or ()), "can.path=closed", "can.virtual_drives=true"]
     _, plan = scenario_of(arguments)
@@ -130,7 +130,7 @@ def doctor(arguments: argparse.Namespace) -> int:
     """`echelon doctor`"""
     from dataclasses import asdict
 
-    from sim.doctor import examine, text
+    from echelon.sim.doctor import examine, text
 
     plan = scenario_of(arguments)[1] if arguments.scenario else None
     findings = examine(plan)
@@ -143,8 +143,8 @@ def doctor(arguments: argparse.Namespace) -> int:
 
 def analyse(arguments: argparse.Namespace) -> int:
     """`echelon analyse`"""
-    from controller.law import BlockGains
-    from controller.sampled import delay_margin, largest_stable_delay, spectral_radius
+    from echelon.controller.law import BlockGains
+    from echelon.controller.sampled import delay_margin, largest_stable_delay, spectral_radius
 
     _, plan = scenario_of(arguments)
     period_s = plan.root.period_ns / 1e9
@@ -185,13 +185,13 @@ def analyse(arguments: argparse.Namespace) -> int:
 
 def can(arguments: argparse.Namespace) -> int:
     """`echelon can`"""
-    from sim import can_commands
+    from echelon.sim import can_commands
 
     return can_commands.can(arguments)
 
 
 def referee(arguments: argparse.Namespace) -> int:
     """`echelon referee`"""
-    from sim import can_commands
+    from echelon.sim import can_commands
 
     return can_commands.referee(arguments)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.blocks import POSITION
-from sim.trace import Trace
+from echelon.sim.blocks import POSITION
+from echelon.sim.trace import Trace
 
 Array = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from echelon.plan import Plan
 from echelon.session import Session, loopback_endpoints
-from sim.can_checks import check_fit, check_interfaces, check_multicast, check_tools, check_vcan
-from sim.finding import LIMIT_S, Finding
+from echelon.sim.can_checks import check_fit, check_interfaces, check_multicast, check_tools, check_vcan
+from echelon.sim.finding import LIMIT_S, Finding
 
 PACKAGES: Final = ("eclipse-zenoh", "python-can", "numpy", "scipy", "cantools", "mcap", "pydantic")
 OLDEST: Final = (3, 11)
@@ -191,7 +191,7 @@ def check_disk(folder: Path) -> Finding:
 
 def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Finding:
     """Whether the plan's shortest period can be kept here in real time, by the work of a few instants in this process."""
-    from sim.engine import Engine
+    from echelon.sim.engine import Engine
 
     period_s = min(robot.period_ns for robot in plan.robots) / 1e9
     engine = Engine(plan)

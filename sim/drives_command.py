@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Final
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import listen_command
-from bridge.drive_bank import DriveBank
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import listen_command
+from echelon.bridge.drive_bank import DriveBank
 from echelon.drives import identifiers
 from echelon.plan import Plan, RobotPlan
-from sim.wall import RunClock
-from sim.wall_drives import WallDrives
+from echelon.sim.wall import RunClock
+from echelon.sim.wall_drives import WallDrives
 
 LINE_S: Final = 1.0
 """Between two lines."""

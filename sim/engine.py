@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from itertools import groupby
 from math import gcd
 
-from agents.robot import make_robot
-from controller.node import TreeNode
+from echelon.agents.robot import make_robot
+from echelon.controller.node import TreeNode
 from echelon.link import LinkCounts
 from echelon.mailbox import Mailbox
 from echelon.messages import Message
@@ -30,8 +30,8 @@ def make_role(plan: Plan, index: int) -> Role:
         return make_robot(plan, index)
     if index < len(plan.members):
         return TreeNode(plan, index)
-    from bridge.commander import Commander  # the protocols of drives, for two processes alone
-    from bridge.drive_bank import DriveBank
+    from echelon.bridge.commander import Commander  # the protocols of drives, for two processes alone
+    from echelon.bridge.drive_bank import DriveBank
 
     return Commander(plan) if index == plan.stations[0].index else DriveBank(plan)
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS, field_index
-from sim.blocks import block_series, component_names
-from sim.measures import link_row
-from sim.trace import Trace
+from echelon.sim.blocks import block_series, component_names
+from echelon.sim.measures import link_row
+from echelon.sim.trace import Trace
 
 ROBOT_FIELDS: Final = ("x", "y", "theta", "v", "omega", "ax", "ay", "tau_right", "tau_left")
 LINK_FIELDS: Final = (

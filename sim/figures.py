@@ -9,12 +9,12 @@ from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from controller.trajectory import make_trajectory, sample
+from echelon.controller.trajectory import make_trajectory, sample
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan import Plan
-from sim.blocks import Blocks, BlockSeries
-from sim.distances import Distances
-from sim.drawing import (
+from echelon.sim.blocks import Blocks, BlockSeries
+from echelon.sim.distances import Distances
+from echelon.sim.drawing import (
     CENTROID,
     GROUPS,
     INK,
@@ -27,8 +27,8 @@ from sim.drawing import (
     thin,
     time_axis,
 )
-from sim.measures import settling_ns
-from sim.trace import Trace
+from echelon.sim.measures import settling_ns
+from echelon.sim.trace import Trace
 
 Array = NDArray[np.float64]
 SMALL_MULTIPLES: Final = 16

@@ -11,10 +11,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from controller.trajectory import make_trajectory
-from controller.transformation import Transformation
+from echelon.controller.trajectory import make_trajectory
+from echelon.controller.transformation import Transformation
 from echelon.plan import Plan
-from sim.supervisor import Progress
+from echelon.sim.supervisor import Progress
 
 PLAIN_S = 2.0
 """Between two plain lines."""

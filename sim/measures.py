@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS
 from echelon.plan import BlockPlan, Plan
-from sim.blocks import Blocks, BlockSeries
-from sim.distances import Distances
-from sim.trace import Trace
+from echelon.sim.blocks import Blocks, BlockSeries
+from echelon.sim.distances import Distances
+from echelon.sim.trace import Trace
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any, Final
 
-from sim.summary import number
+from echelon.sim.summary import number
 
 LONG: Final = 24
 """A table's text of more characters may take several lines."""

@@ -18,8 +18,8 @@ from typing import Final
 
 from echelon.runner import Runner
 from echelon.session import Session
-from sim.engine import make_role
-from sim.joining import ProcessSpec, Result, StartError, meet, resources
+from echelon.sim.engine import make_role
+from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
@@ -42,9 +42,9 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         if not spec.virtual and spec.kind == "recorder":
             os.nice(10)  # it has time, others have not
         if spec.kind == "recorder":
-            from sim.watchers import run_recorder as body
+            from echelon.sim.watchers import run_recorder as body
         elif spec.kind == "referee":
-            from sim.wall_drives import run_wall_referee as body
+            from echelon.sim.wall_drives import run_wall_referee as body
         elif spec.kind in ("bridge", "drives"):
             body = _station_body(spec)
         else:
@@ -77,18 +77,18 @@ def _open(spec: ProcessSpec) -> Session:
 def _station_body(spec: ProcessSpec) -> Body:
     """Returns what a process between robots and wheels does; each way needs modules of its own."""
     if not spec.plan.stations:
-        from sim.watchers import run_bridge
+        from echelon.sim.watchers import run_bridge
 
         return run_bridge
     if spec.virtual:
-        from sim.stations import run_station
+        from echelon.sim.stations import run_station
 
         return run_station
     if spec.kind == "bridge":
-        from sim.wall_bridge import run_wall_bridge
+        from echelon.sim.wall_bridge import run_wall_bridge
 
         return run_wall_bridge
-    from sim.wall_drives import run_wall_drives
+    from echelon.sim.wall_drives import run_wall_drives
 
     return run_wall_drives
 

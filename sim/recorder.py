@@ -6,13 +6,13 @@ Every time in the file is the run's own, so the same run gives the same bytes.
 from pathlib import Path
 from typing import Final
 
-from bridge.frame_message import TimedFrame
+from echelon.bridge.frame_message import TimedFrame
 from echelon.link import LinkCounts
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
-from sim import ros
-from sim.chunked import ChunkedFile
-from sim.scene import DESIRED, Scene, desired
+from echelon.sim import ros
+from echelon.sim.chunked import ChunkedFile
+from echelon.sim.scene import DESIRED, Scene, desired
 
 SCENARIO: Final = "scenario.toml"
 """The name of the attachment that holds the effective scenario."""

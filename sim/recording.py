@@ -25,10 +25,10 @@ from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS
 from echelon.messages import Channel as MessageChannel
 from echelon.plan import Plan
-from sim import ros
-from sim.chunked import CHUNK_SIZE, MAGIC, METADATA
-from sim.recorder import LINKS, SCENARIO, state_topic
-from sim.trace import Trace
+from echelon.sim import ros
+from echelon.sim.chunked import CHUNK_SIZE, MAGIC, METADATA
+from echelon.sim.recorder import LINKS, SCENARIO, state_topic
+from echelon.sim.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")

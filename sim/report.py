@@ -6,11 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sim.blocks import Blocks, block_series
-from sim.can_report import can_section
-from sim.distances import Distances, distances
-from sim.figures import SMALL_MULTIPLES, errors, smallest_distance, trajectories, transformed_state, wheel_torques
-from sim.page import (
+from echelon.sim.blocks import Blocks, block_series
+from echelon.sim.can_report import can_section
+from echelon.sim.distances import Distances, distances
+from echelon.sim.figures import (
+    SMALL_MULTIPLES,
+    errors,
+    smallest_distance,
+    trajectories,
+    transformed_state,
+    wheel_torques,
+)
+from echelon.sim.page import (
     figure,
     header,
     page,
@@ -23,8 +30,8 @@ from sim.page import (
     tiles,
     verdict,
 )
-from sim.summary import number
-from sim.trace import Trace
+from echelon.sim.summary import number
+from echelon.sim.trace import Trace
 
 MAX_ROWS: Final = 60
 """Rows of a table on the page; the summary has them all."""

@@ -13,18 +13,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.frame_message import frames_of
+from echelon.bridge.frame_message import frames_of
 from echelon.load import effective_toml
 from echelon.messages import Channel
 from echelon.plan import Plan
 from echelon.scenario import Scenario
-from sim.engine import Engine
-from sim.live import Display
-from sim.merge import TimeOrder
-from sim.summary import summarise, write
-from sim.supervisor import Outcome, Progress, Supervisor
-from sim.trace import Trace
-from sim.watchers import Recording
+from echelon.sim.engine import Engine
+from echelon.sim.live import Display
+from echelon.sim.merge import TimeOrder
+from echelon.sim.summary import summarise, write
+from echelon.sim.supervisor import Outcome, Progress, Supervisor
+from echelon.sim.trace import Trace
+from echelon.sim.watchers import Recording
 
 PARTS: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
@@ -109,7 +109,7 @@ def execute(
 
 def judged(log: Path, plan: Plan, clock: str, whole: bool) -> dict[str, Any]:
     """Returns what the referee finds in a run's can.log."""
-    from bridge.referee import judge_log
+    from echelon.bridge.referee import judge_log
 
     tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
     return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole) | {"source": "can.log"}
@@ -130,14 +130,14 @@ def _in_process(
     engine = Engine(plan, gathered.append)
     station: Any = None
     if plan.stations:
-        from bridge.closed import ClosedStation
-        from bridge.commander import Commander
+        from echelon.bridge.closed import ClosedStation
+        from echelon.bridge.commander import Commander
 
         commander = engine.roles[plan.stations[0].index]
         assert isinstance(commander, Commander)
         station = ClosedStation(plan, can_urls, folder, paired=False, role=commander)
     elif can_urls:
-        from bridge.station import Station
+        from echelon.bridge.station import Station
 
         station = Station(plan, can_urls, folder)
     order = TimeOrder(range(len(plan.everyone) if plan.stations else len(plan.members) + bool(can_urls)))
@@ -209,8 +209,8 @@ def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
         return {}
     result: dict[str, Any] = station.result()
     if engine.plan.stations[1:]:
-        from bridge.buses import merge_rows
-        from bridge.drive_bank import DriveBank
+        from echelon.bridge.buses import merge_rows
+        from echelon.bridge.drive_bank import DriveBank
 
         drives = engine.roles[engine.plan.stations[1].index]
         assert isinstance(drives, DriveBank)

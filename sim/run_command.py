@@ -7,20 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from echelon.plan import Plan
-from sim.usage import UsageError, scenario_of
+from echelon.sim.usage import UsageError, scenario_of
 
 
 def run(arguments: argparse.Namespace) -> int:
     """`echelon run`"""
     if arguments.engine == "processes":
-        from sim.children import warm_up
+        from echelon.sim.children import warm_up
 
         warm_up()
     scenario, plan = scenario_of(arguments)
-    from sim.bus_urls import bus_urls, check_wall_clock
-    from sim.live import Display
-    from sim.run import execute, new_folder
-    from sim.summary import summary_text
+    from echelon.sim.bus_urls import bus_urls, check_wall_clock
+    from echelon.sim.live import Display
+    from echelon.sim.run import execute, new_folder
+    from echelon.sim.summary import summary_text
 
     can_urls = bus_urls(plan, arguments.can, arguments.engine == "inprocess")
     if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     failure = finished.failure
     if not arguments.no_report:
         try:
-            from sim.run_folder import report_on  # matplotlib, when it is needed
+            from echelon.sim.run_folder import report_on  # matplotlib, when it is needed
 
             report_on([folder], folder / "report.html")
         except (UsageError, OSError) as error:  # of a run that broke off there may be nothing to report

@@ -7,13 +7,13 @@ from typing import Any, Final
 
 import cantools
 
-from bridge.canlog import Logged, read_log
-from bridge.plan_dbc import plan_dbc
+from echelon.bridge.canlog import Logged, read_log
+from echelon.bridge.plan_dbc import plan_dbc
 from echelon.load import ScenarioError, parse
 from echelon.plan import Plan
-from sim.recording import read_trace
-from sim.report import RunForReport, write_report
-from sim.usage import UsageError
+from echelon.sim.recording import read_trace
+from echelon.sim.report import RunForReport, write_report
+from echelon.sim.usage import UsageError
 
 FRAMES: Final = 18
 """So many frames a report shows, from run time 0 on."""

@@ -5,10 +5,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.trajectory import make_trajectory
+from echelon.controller.trajectory import make_trajectory
 from echelon.messages import STATE_FIELDS, Values
 from echelon.plan import NodePlan, Plan
-from sim import ros
+from echelon.sim import ros
 
 Array = NDArray[np.float64]
 

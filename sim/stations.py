@@ -10,14 +10,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.bus import open_bus
-from bridge.closed import ClosedStation
-from bridge.drive_bank import DriveBank
-from bridge.on_bus import BusError, Rail, on_bus
+from echelon.bridge.bus import open_bus
+from echelon.bridge.closed import ClosedStation
+from echelon.bridge.drive_bank import DriveBank
+from echelon.bridge.on_bus import BusError, Rail, on_bus
 from echelon.role import Role, Stage
 from echelon.runner import Runner
 from echelon.session import Session
-from sim.joining import ProcessSpec, Result, StartError, meet, resources
+from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
 
 PROGRESS_S: Final = 0.2
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from echelon.link import LinkCounts
 from echelon.plan import Plan
-from sim.blocks import block_series
-from sim.can_lines import can_lines, can_reasons
-from sim.distances import Distances, distances
-from sim.measures import block_row, claim_rows, distance_row, link_row, separation_rows, torque_row
-from sim.trace import Trace
+from echelon.sim.blocks import block_series
+from echelon.sim.can_lines import can_lines, can_reasons
+from echelon.sim.distances import Distances, distances
+from echelon.sim.measures import block_row, claim_rows, distance_row, link_row, separation_rows, torque_row
+from echelon.sim.trace import Trace
 
 FORMAT: Final = 1
 

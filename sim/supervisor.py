@@ -13,12 +13,12 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.buses import merge_rows
+from echelon.bridge.buses import merge_rows
 from echelon.link import LinkCounts
 from echelon.plan import Plan
-from sim.children import FINISHING, Child, list_specs, start
-from sim.joining import ProcessSpec, Result
-from sim.trace import Trace, TraceBuilder
+from echelon.sim.children import FINISHING, Child, list_specs, start
+from echelon.sim.joining import ProcessSpec, Result
+from echelon.sim.trace import Trace, TraceBuilder
 
 START_TIMEOUT_S: Final = 30.0
 STALL_REPORT_S: Final = 3.0

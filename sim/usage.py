@@ -7,7 +7,7 @@ from echelon.load import ScenarioError, load
 from echelon.plan import Plan
 from echelon.scenario import Scenario
 
-SCENARIOS = Path(__file__).resolve().parent.parent / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).parent.parent / "deploy" / "scenarios"
 
 
 class UsageError(Exception):

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from bridge.bus import Bus, Received
+from echelon.bridge.bus import Bus, Received
 from echelon.layout import message_size
 from echelon.messages import Channel, Message
 from echelon.plan import Plan

@@ -13,19 +13,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from bridge.bus_load import BitCount
-from bridge.closed import ClosedStation
-from bridge.commander import Commander
-from bridge.frame import Frame
-from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
-from bridge.paced_bus import PacedBus
+from echelon.bridge.bus_load import BitCount
+from echelon.bridge.closed import ClosedStation
+from echelon.bridge.commander import Commander
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
+from echelon.bridge.paced_bus import PacedBus
 from echelon.link import Link
 from echelon.messages import Channel, Message
 from echelon.plan import on_wall_clock
 from echelon.session import Session
+from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
+from echelon.sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
 from echelon.wire import count_refusal, data_key, encode, join, watch_key
-from sim.joining import ProcessSpec, Result, StartError, meet, resources
-from sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
 
 FEEDBACK_SHARE: Final = 8
 """Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""

@@ -4,21 +4,21 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
-from bridge.bus import Bus, open_bus
-from bridge.buses import bus_row, make_buses
-from bridge.disturbances import Disturbances
-from bridge.drive_bank import DriveBank
-from bridge.fit import plan_fit
-from bridge.frame import Frame
-from bridge.frame_message import TimedFrame
-from bridge.paced_bus import PacedBus
-from bridge.referee import Referee
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.buses import bus_row, make_buses
+from echelon.bridge.disturbances import Disturbances
+from echelon.bridge.drive_bank import DriveBank
+from echelon.bridge.fit import plan_fit
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import TimedFrame
+from echelon.bridge.paced_bus import PacedBus
+from echelon.bridge.referee import Referee
 from echelon.messages import Channel
 from echelon.plan import Plan, on_wall_clock
 from echelon.session import Session
+from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
+from echelon.sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
 from echelon.wire import data_key
-from sim.joining import ProcessSpec, Result, StartError, meet, resources
-from sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
 
 
 def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) -> None:

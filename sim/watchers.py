@@ -10,16 +10,16 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.frame_message import unpack
+from echelon.bridge.frame_message import unpack
 from echelon.layout import said_by
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.session import Inbox, Session
+from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
+from echelon.sim.merge import TimeOrder
+from echelon.sim.recorder import Recorder
+from echelon.sim.trace import TraceBuilder
 from echelon.wire import WireError, count_refusal, decode, encode, join, split, watch_key
-from sim.joining import ProcessSpec, Result, StartError, meet, resources
-from sim.merge import TimeOrder
-from sim.recorder import Recorder
-from sim.trace import TraceBuilder
 
 PROGRESS_S: Final = 0.2
 SLACK_NS: Final = 60_000_000_000
@@ -161,7 +161,7 @@ class Recording:
 
 def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """The bridge process: robots' torques to frames, on the bus, in can.log, and to the recorder."""
-    from bridge.station import Station  # python-can and cantools, for this process alone
+    from echelon.bridge.station import Station  # python-can and cantools, for this process alone
 
     plan = spec.plan
     robots = [robot.index for robot in plan.robots]

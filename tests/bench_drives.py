@@ -7,8 +7,8 @@ from dataclasses import replace
 from math import inf
 from typing import Any, Self
 
-from bridge.bus import open_bus
-from bridge.frame import Drive, Frame
+from echelon.bridge.bus import open_bus
+from echelon.bridge.frame import Drive, Frame
 from echelon.can_plan import DrivePlan, EnvelopePlan, MotorPlan
 
 MS = 1_000_000

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from bridge.cia402.drive import Cia402Drive
-from bridge.cia402.host import Cia402Host, Master
-from bridge.frame import Frame
+from echelon.bridge.cia402.drive import Cia402Drive
+from echelon.bridge.cia402.host import Cia402Host, Master
+from echelon.bridge.frame import Frame
 from echelon.can_plan import DrivePlan
 from tests.bench_drives import MS, drive_plan
 

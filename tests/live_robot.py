@@ -8,10 +8,10 @@ from typing import Any, Self
 import numpy as np
 import tomlkit
 
-from bridge.bus import open_bus
-from bridge.cia402.host import Master
-from bridge.frame import Frame
-from bridge.protocols import drive_places, make_drive, make_host
+from echelon.bridge.bus import open_bus
+from echelon.bridge.cia402.host import Master
+from echelon.bridge.frame import Frame
+from echelon.bridge.protocols import drive_places, make_drive, make_host
 from echelon.load import load
 from echelon.plan import Plan
 from tests.bench_drives import Bench

@@ -5,7 +5,7 @@ from typing import Any
 from cantools.database.can import Database, Message
 from odrive_can import get_dbc
 
-from bridge.frame import Frame
+from echelon.bridge.frame import Frame
 
 VENDOR: Database = get_dbc()
 """Axes 0 .. 7"""

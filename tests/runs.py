@@ -10,8 +10,8 @@ from typing import Any
 
 from echelon.load import load
 from echelon.plan import Plan
-from sim.engine import Engine
-from sim.trace import Trace, TraceBuilder
+from echelon.sim.engine import Engine
+from echelon.sim.trace import Trace, TraceBuilder
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIOS = ROOT / "deploy" / "scenarios"
@@ -32,7 +32,7 @@ def trace_of(plan: Plan) -> Trace:
 def echelon(*arguments: str | Path, timeout: float = 120, **options: Any) -> subprocess.CompletedProcess[str]:
     """Runs the command line to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "echelon.cli", *map(str, arguments)],
+        [sys.executable, "-m", "echelon", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=timeout,
@@ -45,7 +45,7 @@ def echelon(*arguments: str | Path, timeout: float = 120, **options: Any) -> sub
 def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
     """Starts the command line in a session of its own, so that all its processes can be found."""
     return subprocess.Popen(
-        [sys.executable, "-m", "echelon.cli", *map(str, arguments)],
+        [sys.executable, "-m", "echelon", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
@@ -71,7 +71,7 @@ def _alive() -> list[tuple[int, int, int]]:
 
 def lab_dbc(torque_scale: float = 0.001) -> str:
     """Returns the DBC of lab.toml's robots, g1/r1 to g3/r9, with native drives."""
-    from bridge.plan_dbc import plan_dbc
+    from echelon.bridge.plan_dbc import plan_dbc
 
     return plan_dbc(plan_of("lab", f"can.torque_scale={torque_scale!r}"))
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.trajectory import make_trajectory, sample
-from controller.transformation import Transformation
+from echelon.controller.trajectory import make_trajectory, sample
+from echelon.controller.transformation import Transformation
 from echelon.link import LinkCounts
 from echelon.load import load
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Plan
 from echelon.scenario import Scenario
-from sim.trace import Trace
+from echelon.sim.trace import Trace
 
 PAPER = Path(__file__).parent.parent / "deploy" / "scenarios" / "paper.toml"
 DECAY = {"intra": 0.02, "inter": 0.2, "centroid": 2.0}

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.bridge import Bridge, Stop
-from bridge.bus_load import frame_bits
-from bridge.native.codec import NativeCodec, Torque
-from bridge.native.counter import CounterCheck
+from echelon.bridge.bridge import Bridge, Stop
+from echelon.bridge.bus_load import frame_bits
+from echelon.bridge.native.codec import NativeCodec, Torque
+from echelon.bridge.native.counter import CounterCheck
 
 MS = 1_000_000
 CODEC = NativeCodec(0.001)

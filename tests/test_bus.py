@@ -15,9 +15,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import interface_is_up, listen_command, resolve_url
-from bridge.wires import RawCan
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import interface_is_up, listen_command, resolve_url
+from echelon.bridge.wires import RawCan
 
 FRAMES = [(0x100 + number % 9, number.to_bytes(8, "little")) for number in range(500)]
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.bus_load import bus_load, frame_bits, many_frame_bits, worst_case_bits
+from echelon.bridge.bus_load import bus_load, frame_bits, many_frame_bits, worst_case_bits
 
 
 def by_hand(can_id: int, data: bytes, remote: bool = False) -> int:

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import Philox
 
-from bridge.bus_load import frame_bits, worst_case_bits
-from bridge.bus_model import BusEvent, BusEventKind, BusModel, Delivered
-from bridge.bus_time import BusTime
-from bridge.frame import Frame
-from bridge.ideal_bus import IdealBus
+from echelon.bridge.bus_load import frame_bits, worst_case_bits
+from echelon.bridge.bus_model import BusEvent, BusEventKind, BusModel, Delivered
+from echelon.bridge.bus_time import BusTime
+from echelon.bridge.frame import Frame
+from echelon.bridge.ideal_bus import IdealBus
 
 MEGA = 1_000_000
 BIT = 1_000  # ns at 1 Mbit/s

@@ -10,14 +10,14 @@ import pytest
 from rich.console import Console
 from runs import echelon, plan_of, start_echelon, until
 
-from bridge.bus import open_bus
-from bridge.bus_load import worst_case_bits
-from bridge.canlog import read_log
-from bridge.frame import Frame
-from bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
-from bridge.referee import Referee
+from echelon.bridge.bus import open_bus
+from echelon.bridge.bus_load import worst_case_bits
+from echelon.bridge.canlog import read_log
+from echelon.bridge.frame import Frame
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
+from echelon.bridge.referee import Referee
 from echelon.cli import main
-from sim.can_table import HALF, CanTable, Rate, bar
+from echelon.sim.can_table import HALF, CanTable, Rate, bar
 from tests.live_robot import TORQUES, LiveRobot, one_robot
 
 MS = 1_000_000
@@ -260,7 +260,7 @@ def test_a_bus_that_is_alive(protocol: str, tmp_path: Path, capsys: pytest.Captu
 def test_a_table_in_a_terminal(tmp_path: Path) -> None:
     from argparse import Namespace
 
-    from sim import can_commands
+    from echelon.sim import can_commands
 
     path, plan = one_robot(tmp_path)
     url = free_url()

@@ -11,8 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from bridge.canlog import FLUSH_NS, CanLog
-from bridge.native.codec import NativeCodec, frame_id
+from echelon.bridge.canlog import FLUSH_NS, CanLog
+from echelon.bridge.native.codec import NativeCodec, frame_id
 from tests.runs import lab_dbc
 
 EPOCH = 1_700_000_000_000_000_000

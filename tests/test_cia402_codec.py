@@ -12,12 +12,22 @@ from canopen.profiles.p402 import OperationMode, State402
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge import cia402
-from bridge.cia402 import codec
-from bridge.cia402.codec import AUTOMATIC, TRANSITIONS, Command, ErrorCode, Nmt, NmtCommand, State, command_of, state_of
-from bridge.cia402.eds import eds
-from bridge.cia402.objects import INDICES, OBJECTS, RPDO_MAPPED, TPDO_MAPPED, Dictionary, Type
-from bridge.frame import Frame
+from echelon.bridge import cia402
+from echelon.bridge.cia402 import codec
+from echelon.bridge.cia402.codec import (
+    AUTOMATIC,
+    TRANSITIONS,
+    Command,
+    ErrorCode,
+    Nmt,
+    NmtCommand,
+    State,
+    command_of,
+    state_of,
+)
+from echelon.bridge.cia402.eds import eds
+from echelon.bridge.cia402.objects import INDICES, OBJECTS, RPDO_MAPPED, TPDO_MAPPED, Dictionary, Type
+from echelon.bridge.frame import Frame
 
 EDS = Path(cia402.__file__).with_name("drive.eds")
 COMMANDS = {

@@ -9,10 +9,10 @@ from canopen.profiles.p402 import State402
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.cia402.drive import Cia402Drive
-from bridge.cia402.sdo import Abort, SdoClient
-from bridge.frame import Frame
-from bridge.motor import Fault
+from echelon.bridge.cia402.drive import Cia402Drive
+from echelon.bridge.cia402.sdo import Abort, SdoClient
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
 from tests.bench_drives import MS, motor_plan
 from tests.cia402_rig import plan_of
 

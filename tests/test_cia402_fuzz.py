@@ -5,11 +5,11 @@ from random import Random
 
 import pytest
 
-from bridge.cia402.codec import State
-from bridge.cia402.drive import Cia402Drive
-from bridge.cia402.host import Cia402Host
-from bridge.frame import Frame
-from bridge.motor import ON_DEMAND
+from echelon.bridge.cia402.codec import State
+from echelon.bridge.cia402.drive import Cia402Drive
+from echelon.bridge.cia402.host import Cia402Host
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import ON_DEMAND
 from tests.bench_drives import MS
 from tests.cia402_rig import Rig, plan_of
 

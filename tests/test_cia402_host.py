@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from bridge.cia402.host import Cia402Host, Master
-from bridge.frame import Frame
-from bridge.motor import Fault
+from echelon.bridge.cia402.host import Cia402Host, Master
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
 from tests.bench_drives import MS, motor_plan
 from tests.cia402_rig import PERIOD_NS, Rig, plan_of
 

@@ -11,11 +11,11 @@ from cantools.database import Database
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.cia402.dbc import messages
-from bridge.cia402.observe import Cia402Observer
-from bridge.frame import Frame
-from bridge.motor import LATCHING, Fault
-from bridge.observe import Finding
+from echelon.bridge.cia402.dbc import messages
+from echelon.bridge.cia402.observe import Cia402Observer
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import LATCHING, Fault
+from echelon.bridge.observe import Finding
 from tests.bench_drives import ENVELOPE, MS, motor_plan
 from tests.cia402_rig import PERIOD_NS, Rig, plan_of
 

@@ -10,7 +10,17 @@ from canopen.sdo.exceptions import SdoAbortedError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.cia402.sdo import MAX_DOWNLOAD, Abort, Key, SdoClient, SdoError, SdoServer, abort, abort_code, written
+from echelon.bridge.cia402.sdo import (
+    MAX_DOWNLOAD,
+    Abort,
+    Key,
+    SdoClient,
+    SdoError,
+    SdoServer,
+    abort,
+    abort_code,
+    written,
+)
 
 KEY = (0x2345, 6)
 contents = st.binary(min_size=1, max_size=60)

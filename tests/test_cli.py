@@ -11,7 +11,7 @@ import cantools
 import pytest
 from runs import ROOT, echelon, plan_of, trace_of
 
-from sim.recording import read_links, read_metadata, read_scenario, read_trace
+from echelon.sim.recording import read_links, read_metadata, read_scenario, read_trace
 
 QUICK = ("--set", "duration=0.2", "--set", "claims=[]")
 

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.commander import NOT_COMMANDED, Commander
-from bridge.drive_bank import DriveBank
-from bridge.frame import Frame
-from bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
+from echelon.bridge.commander import NOT_COMMANDED, Commander
+from echelon.bridge.drive_bank import DriveBank
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
-from sim.engine import Engine
-from sim.trace import TraceBuilder
+from echelon.sim.engine import Engine
+from echelon.sim.trace import TraceBuilder
 from tests.runs import plan_of
 
 MS = 1_000_000

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_load import frame_bits
-from bridge.bus_url import resolve_url
-from bridge.canlog import read_log
-from bridge.frame_message import BRIDGE_NODE
-from bridge.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
-from sim.joining import ProcessSpec
-from sim.supervisor import Supervisor
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_load import frame_bits
+from echelon.bridge.bus_url import resolve_url
+from echelon.bridge.canlog import read_log
+from echelon.bridge.frame_message import BRIDGE_NODE
+from echelon.bridge.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
+from echelon.sim.joining import ProcessSpec
+from echelon.sim.supervisor import Supervisor
 from tests.runs import echelon, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, until
 
 SHORT = ("--set", "duration=0.5", "--set", "claims=[]", "--no-report", "--quiet")

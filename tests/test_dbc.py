@@ -9,8 +9,8 @@ import cantools
 import pytest
 from cantools.database.can import Database
 
-from bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status, frame_id
-from bridge.plan_dbc import identifiers
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status, frame_id
+from echelon.bridge.plan_dbc import identifiers
 from tests.runs import lab_dbc
 
 ROBOTS = [f"g{1 + number // 3}_r{1 + number}" for number in range(9)]

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from runs import echelon, plan_of
 
-from bridge.bus import open_bus
-from bridge.bus_url import resolve_url
-from sim import can_checks, doctor
-from sim.doctor import Measured
-from sim.finding import Finding
+from echelon.bridge.bus import open_bus
+from echelon.bridge.bus_url import resolve_url
+from echelon.sim import can_checks, doctor
+from echelon.sim.doctor import Measured
+from echelon.sim.finding import Finding
 
 
 def test_this_machine_can_run_lab_and_says_so() -> None:

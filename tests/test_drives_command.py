@@ -8,11 +8,11 @@ from subprocess import Popen
 import pytest
 from runs import echelon, kill_session, plan_of, start_echelon
 
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import resolve_url
-from bridge.frame import Frame, Host
-from bridge.protocols import make_host
-from sim.drives_command import describe
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import resolve_url
+from echelon.bridge.frame import Frame, Host
+from echelon.bridge.protocols import make_host
+from echelon.sim.drives_command import describe
 
 PATIENCE_S = 20.0
 

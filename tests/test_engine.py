@@ -8,16 +8,16 @@ import pytest
 from scipy.integrate import solve_ivp
 from synthetic import PAPER
 
-from controller.law import CentralLaw
-from controller.sampled import spectral_radius
+from echelon.controller.law import CentralLaw
+from echelon.controller.sampled import spectral_radius
 from echelon.load import load
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Array, Plan
-from sim.blocks import block_series
-from sim.distances import distances
-from sim.engine import Engine
-from sim.measures import claim_rows
-from sim.trace import Trace, TraceBuilder
+from echelon.sim.blocks import block_series
+from echelon.sim.distances import distances
+from echelon.sim.engine import Engine
+from echelon.sim.measures import claim_rows
+from echelon.sim.trace import Trace, TraceBuilder
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 UNTIL = 2.0

@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
-import bridge.envelope
-from bridge.envelope import Violation
+from echelon.bridge import envelope
+from echelon.bridge.envelope import Violation
 from echelon.can_plan import EnvelopePlan
 
 INF = math.inf
@@ -300,7 +300,7 @@ CHECKS: list[Callable[[ModuleType], None]] = [value for name, value in list(glob
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_envelope(check: Callable[[ModuleType], None]) -> None:
-    check(bridge.envelope)
+    check(envelope)
 
 
 eighths = st.integers(-40, 40).map(lambda n: n / 8)
@@ -312,7 +312,7 @@ class Gates(RuleBasedStateMachine):
 
     @initialize(plan=st.builds(EnvelopePlan, limits, limits, limits, limits, st.integers(0, 5)), now=st.integers())
     def build(self, plan: EnvelopePlan, now: int) -> None:
-        self.gate, self.slow, self.now = bridge.envelope.Envelope(plan), SlowGate(plan), now
+        self.gate, self.slow, self.now = envelope.Envelope(plan), SlowGate(plan), now
 
     gaps = st.one_of(st.integers(-2, 5), st.sampled_from([MS, WINDOW // 2, WINDOW - 1, WINDOW, WINDOW + 1]))
 
@@ -344,7 +344,7 @@ TestGates = Gates.TestCase
 
 @given(st.floats(0, 1e6), st.floats(0, 1e6))
 def test_what_is_computed_to_be_at_a_limit_passes(start: float, limit: float) -> None:
-    gate = bridge.envelope.Envelope(replace(FREE, rise_limit=max(start, limit), fall_limit=limit))
+    gate = envelope.Envelope(replace(FREE, rise_limit=max(start, limit), fall_limit=limit))
     assert sent(gate, 0, start, -start) == ""
     top = start + max(start, limit)
     assert sent(gate, 1, top, -top) == ""

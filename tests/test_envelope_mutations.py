@@ -13,9 +13,9 @@ from types import FrameType, ModuleType
 import pytest
 from test_envelope import CHECKS
 
-import bridge.envelope
+from echelon.bridge import envelope
 
-SOURCE = inspect.getsource(bridge.envelope)
+SOURCE = inspect.getsource(envelope)
 CPU_SECONDS = 2.0  # a mutant may loop for ever
 
 ORDERS: tuple[type[ast.cmpop], ...] = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
@@ -127,7 +127,7 @@ def mutants() -> dict[str, str]:
 
 def survives(source: str) -> bool:
     """True if no check notices."""
-    module = ModuleType("bridge.envelope")
+    module = ModuleType("echelon.bridge.envelope")
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise TimeoutError("the mutant does not come to an end")

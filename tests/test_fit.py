@@ -2,10 +2,10 @@
 
 import pytest
 
-from bridge.commander import Commander
-from bridge.fit import bus_fit, robot_streams
-from bridge.protocols import shared_cyclic
-from sim.engine import Engine
+from echelon.bridge.commander import Commander
+from echelon.bridge.fit import bus_fit, robot_streams
+from echelon.bridge.protocols import shared_cyclic
+from echelon.sim.engine import Engine
 from tests.runs import plan_of
 
 SECONDS = 2

@@ -11,8 +11,8 @@ from scipy.optimize import root
 from synthetic import PAPER
 from trees import PAPER_TREE, plan_of, random_epsilon, random_law, scenario, trees, with_random_gains
 
-from controller.law import BlockGains, CentralLaw
-from controller.potential import PairForces, pairs_between
+from echelon.controller.law import BlockGains, CentralLaw
+from echelon.controller.potential import PairForces, pairs_between
 from echelon.load import load
 from echelon.plan import Array, AvoidancePlan, Plan
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from runs import plan_of
 
-import sim.live
-from controller.trajectory import make_trajectory
-from controller.transformation import Transformation
+from echelon.controller.trajectory import make_trajectory
+from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
-from sim.live import Display
-from sim.supervisor import Progress
+from echelon.sim import live
+from echelon.sim.live import Display
+from echelon.sim.supervisor import Progress
 
 PLAN = plan_of("paper")
 
@@ -54,7 +54,7 @@ def test_errors_of_a_diverged_run_are_no_error() -> None:
 
 def test_plain_lines_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(sim.live.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
     stream = io.StringIO()
     display = Display(PLAN, stream)
     for _ in range(50):  # ten seconds

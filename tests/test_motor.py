@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from bridge.motor import LATCHING, ON_DEMAND, STEP_NS, Fault, Motor
+from echelon.bridge.motor import LATCHING, ON_DEMAND, STEP_NS, Fault, Motor
 from echelon.can_plan import MotorPlan
 from tests.bench_drives import MOTOR, MS, motor_plan
 

@@ -8,7 +8,7 @@ from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.native.codec import (
+from echelon.bridge.native.codec import (
     LENGTH,
     MAX_ROBOTS,
     RAW_MAX,
@@ -23,8 +23,8 @@ from bridge.native.codec import (
     encode_status,
     frame_id,
 )
-from bridge.native.counter import CounterCheck
-from bridge.native.crc import crc8
+from echelon.bridge.native.counter import CounterCheck
+from echelon.bridge.native.crc import crc8
 
 MILLI = NativeCodec(0.001)
 

@@ -8,9 +8,9 @@ from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.frame import Frame
-from bridge.motor import Fault
-from bridge.native.codec import (
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
+from echelon.bridge.native.codec import (
     FaultCode,
     Feedback,
     NativeCodec,
@@ -21,8 +21,8 @@ from bridge.native.codec import (
     decode_status,
     encode_status,
 )
-from bridge.native.drive import CAUSE_PERSISTS, FIRST_NOT_ZERO, NOT_CLEARED, REMOTE, REPEATED, NativeDrive
-from bridge.native.host import NativeHost
+from echelon.bridge.native.drive import CAUSE_PERSISTS, FIRST_NOT_ZERO, NOT_CLEARED, REMOTE, REPEATED, NativeDrive
+from echelon.bridge.native.host import NativeHost
 from tests.bench_drives import MS, drive_plan
 
 ROBOT = 3

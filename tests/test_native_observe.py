@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 
-from bridge.frame import Frame
-from bridge.motor import LATCHING, Fault
-from bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
-from bridge.native.observe import NativeObserver
-from bridge.observe import Finding
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import LATCHING, Fault
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
+from echelon.bridge.native.observe import NativeObserver
+from echelon.bridge.observe import Finding
 from tests.bench_drives import ENVELOPE, MS, drive_plan
 from tests.conformance.test_drives import Rig, enabled_rig
 

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trees import PAPER_TREE, Tree, plan_of, random_epsilon, scenario, trees, with_random_gains
 
-from agents.plant import state_at
-from agents.robot import Robot
-from controller.law import BlockGains, CentralLaw
+from echelon.agents.plant import state_at
+from echelon.agents.robot import Robot
+from echelon.controller.law import BlockGains, CentralLaw
 from echelon.layout import sized
 from echelon.messages import NULL, STATE_FIELDS, Channel, Message
 from echelon.plan import Array, AvoidancePlan, LinkPlan, Plan
-from sim.engine import Engine
+from echelon.sim.engine import Engine
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odrive_can import get_dbc
 
-from bridge.odrive.codec import BROADCAST, MESSAGES, Refusal, Signal, frame_id
-from bridge.odrive.enums import (
+from echelon.bridge.odrive.codec import BROADCAST, MESSAGES, Refusal, Signal, frame_id
+from echelon.bridge.odrive.enums import (
     AxisError,
     AxisState,
     Command,

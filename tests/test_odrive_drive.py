@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from bridge.frame import Frame
-from bridge.motor import Fault
-from bridge.odrive.config import ODriveConfig
-from bridge.odrive.drive import ODriveDrive
-from bridge.odrive.enums import AxisError, AxisState
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
+from echelon.bridge.odrive.config import ODriveConfig
+from echelon.bridge.odrive.drive import ODriveDrive
+from echelon.bridge.odrive.enums import AxisError, AxisState
 from tests.bench_drives import MS, drive_plan, motor_plan
 from tests.odrive_vendor import BROADCAST, VENDOR, frame, heard, last, request
 

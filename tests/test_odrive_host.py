@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from bridge.frame import Frame
-from bridge.motor import LATCHING, Fault
-from bridge.odrive.drive import ODriveDrive
-from bridge.odrive.enums import AxisState
-from bridge.odrive.host import ODriveHost
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import LATCHING, Fault
+from echelon.bridge.odrive.drive import ODriveDrive
+from echelon.bridge.odrive.enums import AxisState
+from echelon.bridge.odrive.host import ODriveHost
 from tests.bench_drives import MS, drive_plan
 from tests.odrive_vendor import frame, heard, request
 

@@ -9,14 +9,14 @@ import cantools.database
 import pytest
 from cantools.database.can import Database
 
-from bridge.frame import Frame
-from bridge.motor import LATCHING, Fault
-from bridge.observe import Finding
-from bridge.odrive.config import ODriveConfig
-from bridge.odrive.dbc import messages
-from bridge.odrive.drive import ODriveDrive
-from bridge.odrive.host import ODriveHost
-from bridge.odrive.observe import ODriveObserver
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import LATCHING, Fault
+from echelon.bridge.observe import Finding
+from echelon.bridge.odrive.config import ODriveConfig
+from echelon.bridge.odrive.dbc import messages
+from echelon.bridge.odrive.drive import ODriveDrive
+from echelon.bridge.odrive.host import ODriveHost
+from echelon.bridge.odrive.observe import ODriveObserver
 from tests.bench_drives import ENVELOPE, MS, drive_plan
 from tests.odrive_vendor import VENDOR, frame, request
 

@@ -6,11 +6,11 @@ from itertools import count
 
 import pytest
 
-import bridge.on_bus
-from bridge.bus import Bus, open_bus
-from bridge.frame import Frame
-from bridge.frame_message import NO_BUS, TimedFrame, pack
-from bridge.on_bus import BusError, Rail, on_bus
+from echelon.bridge import on_bus as on_bus_module
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import NO_BUS, TimedFrame, pack
+from echelon.bridge.on_bus import BusError, Rail, on_bus
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 
@@ -73,7 +73,7 @@ def test_a_station_takes_what_the_bus_carried(buses: tuple[Bus, Bus], is_bridge:
 def test_a_frame_that_did_not_come_as_it_was_sent_is_an_error_and_nothing_is_used(
     buses: tuple[Bus, Bus], monkeypatch: pytest.MonkeyPatch, spoiled: str
 ) -> None:
-    monkeypatch.setattr(bridge.on_bus, "LOST_AFTER_S", 0.05)
+    monkeypatch.setattr(on_bus_module, "LOST_AFTER_S", 0.05)
     mine, other = buses
     frames = [timed.frame for timed in OF_BRIDGE]
     match spoiled:

@@ -7,12 +7,12 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.bus_load import frame_bits, worst_case_bits
-from bridge.bus_model import BusEventKind
-from bridge.bus_time import BusTime
-from bridge.frame import Frame
-from bridge.ideal_bus import IdealBus
-from bridge.paced_bus import PacedBus
+from echelon.bridge.bus_load import frame_bits, worst_case_bits
+from echelon.bridge.bus_model import BusEventKind
+from echelon.bridge.bus_time import BusTime
+from echelon.bridge.frame import Frame
+from echelon.bridge.ideal_bus import IdealBus
+from echelon.bridge.paced_bus import PacedBus
 
 BIT = 2_000  # ns at 500 kbit/s
 LONGEST = worst_case_bits(8) * BIT

@@ -12,12 +12,12 @@ from scipy.integrate import solve_ivp
 from synthetic import PAPER
 from trees import plan_of, scenario
 
-from agents.plant import LOST, PLANTS, RobotState, make_step, state_at
-from agents.robot import Robot
+from echelon.agents.plant import LOST, PLANTS, RobotState, make_step, state_at
+from echelon.agents.robot import Robot
 from echelon.load import load
 from echelon.messages import Channel, Message
 from echelon.plan import Array, RobotPlan
-from sim.engine import Engine
+from echelon.sim.engine import Engine
 
 
 def robot_of(path: str, model: str) -> RobotPlan:

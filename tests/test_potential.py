@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.potential import PairForces, pairs_between, potential
+from echelon.controller.potential import PairForces, pairs_between, potential
 from echelon.plan import Array, AvoidancePlan
 
 PLAN = AvoidancePlan(True, avoidance_radius=0.5, sensing_radius=3.0, force_limit=1e12)

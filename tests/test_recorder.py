@@ -23,12 +23,12 @@ from invented import METADATA, ROOT, invented, paper
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from bridge.frame import Frame
-from bridge.frame_message import TimedFrame
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import TimedFrame
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS, Channel, Message
-from sim import chunked, recording
-from sim.recorder import Recorder
+from echelon.sim import chunked, recording
+from echelon.sim.recorder import Recorder
 
 SCENARIO = 'name = "invented"\n'
 LINKS = [
@@ -274,7 +274,7 @@ CHILD = """
 import sys, time
 from pathlib import Path
 from invented import METADATA, invented, paper
-from sim.recorder import Recorder
+from echelon.sim.recorder import Recorder
 
 recorder = Recorder(Path(sys.argv[1]), paper(), "", METADATA)
 begin = time.monotonic_ns()

@@ -15,10 +15,10 @@ from mcap.writer import CompressionType, Writer
 
 from echelon.link import LinkCounts
 from echelon.messages import Channel, Message
-from sim import chunked
-from sim.recorder import Recorder
-from sim.recording import CutError, read_links, read_metadata, read_scenario, read_trace, recover
-from sim.trace import TraceBuilder
+from echelon.sim import chunked
+from echelon.sim.recorder import Recorder
+from echelon.sim.recording import CutError, read_links, read_metadata, read_scenario, read_trace, recover
+from echelon.sim.trace import TraceBuilder
 
 SCENARIO = 'name = "µ"\r\n'
 LINKS = [LinkCounts(0, 9, Channel.STATE, 21, 20, 1, 0, 20, 2, 1.5e6 / 7, 3_000_000)]

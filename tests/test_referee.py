@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import plan_of
 
-from bridge.canlog import CanLog
-from bridge.frame import Frame
-from bridge.frame_message import unpack
-from bridge.referee import KEPT, Referee, judge_log
-from bridge.station import Station
+from echelon.bridge.canlog import CanLog
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import unpack
+from echelon.bridge.referee import KEPT, Referee, judge_log
+from echelon.bridge.station import Station
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
-from sim.engine import Engine
+from echelon.sim.engine import Engine
 
 MS = 1_000_000
 Heard = tuple[int, int, Frame]

@@ -10,10 +10,10 @@ import pytest
 from synthetic import FIELD, PERIOD_NS, Run, decaying, link_counts
 
 from echelon.load import effective_toml
-from sim.drawing import COLUMNS, thin
-from sim.report import RunForReport, write_report
-from sim.summary import summarise
-from sim.trace import Trace
+from echelon.sim.drawing import COLUMNS, thin
+from echelon.sim.report import RunForReport, write_report
+from echelon.sim.summary import summarise
+from echelon.sim.trace import Trace
 
 FIGURES = 5
 NAME = "one & <b>only</b>"

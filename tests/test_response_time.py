@@ -9,10 +9,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from bridge.bus_load import frame_bits, worst_case_bits
-from bridge.bus_time import BusTime
-from bridge.frame import Frame
-from bridge.response_time import BITRATES, Stream, advice, fits, load, remedies, response_times
+from echelon.bridge.bus_load import frame_bits, worst_case_bits
+from echelon.bridge.bus_time import BusTime
+from echelon.bridge.frame import Frame
+from echelon.bridge.response_time import BITRATES, Stream, advice, fits, load, remedies, response_times
 
 MS = 1_000_000
 MEGA = 1_000_000

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS, Channel
-from sim import ros
+from echelon.sim import ros
 
 
 def make_typestore() -> Any:

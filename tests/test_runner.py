@@ -22,9 +22,9 @@ from echelon.plan import Plan
 from echelon.role import Role, Stage
 from echelon.runner import MAX_BATCHES, Runner
 from echelon.session import Receive
+from echelon.sim.engine import Engine, make_role
+from echelon.sim.trace import TraceBuilder
 from echelon.wire import data_key, decode, encode, split
-from sim.engine import Engine, make_role
-from sim.trace import TraceBuilder
 
 RUN = "test"
 TIMEOUT_S = 20.0

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from synthetic import DECAY, FIELD, at_places, decaying, link_counts, of_states, with_states
 
-from sim.can_lines import can_lines, can_reasons
-from sim.distances import distances
-from sim.measures import settling_ns
-from sim.summary import summarise, summary_text, write
-from sim.trace import Trace
+from echelon.sim.can_lines import can_lines, can_reasons
+from echelon.sim.distances import distances
+from echelon.sim.measures import settling_ns
+from echelon.sim.summary import summarise, summary_text, write
+from echelon.sim.trace import Trace
 
 NO_CLAIMS = "claims=[]"
 MS = 1_000_000

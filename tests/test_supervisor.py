@@ -13,9 +13,9 @@ import pytest
 from runs import descendants, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, trace_of, until
 
 from echelon.plan import Plan
-from sim.joining import ProcessSpec
-from sim.recording import read_trace, recover
-from sim.supervisor import Outcome, Progress, Supervisor
+from echelon.sim.joining import ProcessSpec
+from echelon.sim.recording import read_trace, recover
+from echelon.sim.supervisor import Outcome, Progress, Supervisor
 
 LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
 LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0},{channel="reference",loss=1.0}]'
@@ -167,7 +167,7 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
 def test_a_process_that_stands_still_for_a_while_costs_only_time(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sim.supervisor.STALL_REPORT_S", 2.2)
+    monkeypatch.setattr("echelon.sim.supervisor.STALL_REPORT_S", 2.2)
     plan, notes = plan_of("paper", "duration=3", LINKS), []
     stopped: list[int] = []
 

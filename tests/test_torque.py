@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 from synthetic import PAPER
 from trees import plan_of, scenario
 
-from agents.plant import RobotState, make_step, state_at
-from agents.robot import Robot
-from agents.torque import TorqueLimits, make_inverse
+from echelon.agents.plant import RobotState, make_step, state_at
+from echelon.agents.robot import Robot
+from echelon.agents.torque import TorqueLimits, make_inverse
 from echelon.load import load
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Array, RobotPlan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from controller.trajectory import TRAJECTORIES, make_trajectory, sample
+from echelon.controller.trajectory import TRAJECTORIES, make_trajectory, sample
 from echelon.plan import TrajectoryPlan
 
 KINDS = {

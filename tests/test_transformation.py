@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from synthetic import PAPER
 from trees import PAPER_TREE, Tree, plan_of, scenario, trees
 
-from controller.transformation import Transformation, desired_shape, node_matrix, subtree_robots
+from echelon.controller.transformation import Transformation, desired_shape, node_matrix, subtree_robots
 from echelon.load import load
 from echelon.plan import Array, ShapePlan
 

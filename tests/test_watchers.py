@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from invented import METADATA, invented, paper
 
-import sim.watchers
-from bridge.frame import Frame
-from bridge.frame_message import TimedFrame, pack
+from echelon.bridge.frame import Frame
+from echelon.bridge.frame_message import TimedFrame, pack
 from echelon.messages import Channel, Message
+from echelon.sim import watchers
+from echelon.sim.recording import read_metadata, read_trace
+from echelon.sim.watchers import Reception, Recording
 from echelon.wire import encode, join
-from sim.recording import read_metadata, read_trace
-from sim.watchers import Reception, Recording
 
 TICKS = 6
 
@@ -90,7 +90,7 @@ def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.Monk
     silent = Inbox(*parts[:3], [], *parts[3:])  # a broken run: after silence nothing is waited for
     out = [m for portion in reception(silent).drain(None) for m in portion]
     assert {m.source for m in out} == {0, 1, 2}
-    monkeypatch.setattr(sim.watchers, "DRAIN_S", 0.05)  # what never comes is not waited for for ever
+    monkeypatch.setattr(watchers, "DRAIN_S", 0.05)  # what never comes is not waited for for ever
     assert keys([m for portion in reception(Inbox(*parts[:3])).drain(999) for m in portion]) == sorted(keys(out))
 
 

@@ -22,8 +22,8 @@ import struct
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-from bridge.frame import Frame
-from bridge.motor import Fault
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
 
 NMT_ID = 0x000
 SYNC_ID = 0x080

@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-from bridge.cia402 import objects
-from bridge.cia402.codec import HOST_NODE, MODE_CYCLIC_TORQUE, RPDO_IDS, TPDO_IDS, milliseconds, rated_mnm
-from bridge.cia402.sdo import Key
+from echelon.bridge.cia402 import objects
+from echelon.bridge.cia402.codec import HOST_NODE, MODE_CYCLIC_TORQUE, RPDO_IDS, TPDO_IDS, milliseconds, rated_mnm
+from echelon.bridge.cia402.sdo import Key
 from echelon.can_plan import DrivePlan
 
 

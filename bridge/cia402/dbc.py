@@ -10,7 +10,7 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
-from bridge.cia402.codec import (
+from echelon.bridge.cia402.codec import (
     EMCY,
     EMCY_ID,
     HEARTBEAT_ID,
@@ -28,8 +28,8 @@ from bridge.cia402.codec import (
     Nmt,
     rated_mnm,
 )
-from bridge.cia402.configuration import heartbeat_ns
-from bridge.frame import WHEELS
+from echelon.bridge.cia402.configuration import heartbeat_ns
+from echelon.bridge.frame import WHEELS
 from echelon.can_plan import DrivePlan
 
 Choices = OrderedDict[int, str | NamedSignalValue]

@@ -13,8 +13,8 @@
 
 from typing import Final
 
-from bridge.cia402 import objects
-from bridge.cia402.codec import (
+from echelon.bridge.cia402 import objects
+from echelon.bridge.cia402.codec import (
     AUTOMATIC,
     FAULT_CODES,
     FOLLOWS_COMMAND,
@@ -36,12 +36,12 @@ from bridge.cia402.codec import (
     permille,
     rated_mnm,
 )
-from bridge.cia402.node import Node
-from bridge.cia402.objects import Live
-from bridge.cia402.pdo import Pdo
-from bridge.cia402.sdo import Key
-from bridge.frame import Frame
-from bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.cia402.node import Node
+from echelon.bridge.cia402.objects import Live
+from echelon.bridge.cia402.pdo import Pdo
+from echelon.bridge.cia402.sdo import Key
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
 from echelon.can_plan import NEVER_NS, DrivePlan
 
 MODES: Final = (MODE_NONE, MODE_PROFILE_TORQUE, MODE_CYCLIC_TORQUE)

@@ -1,6 +1,6 @@
 """The electronic data sheet (CiA 306) of the drive, from its object dictionary.  drive.eds beside it is this text."""
 
-from bridge.cia402.objects import INDICES, NAMES, OBJECTS, Object
+from echelon.bridge.cia402.objects import INDICES, NAMES, OBJECTS, Object
 
 
 def eds() -> str:

@@ -6,7 +6,7 @@ Each drive is brought up by itself, one SDO request per `poll` (bridge.cia402.wh
 import math
 from collections import Counter
 
-from bridge.cia402.codec import (
+from echelon.bridge.cia402.codec import (
     EMCY_ID,
     HEARTBEAT_ID,
     HOST_NODE,
@@ -17,9 +17,9 @@ from bridge.cia402.codec import (
     Nmt,
     heartbeat,
 )
-from bridge.cia402.configuration import heartbeat_ns
-from bridge.cia402.wheel import Wheel
-from bridge.frame import WHEELS, Frame
+from echelon.bridge.cia402.configuration import heartbeat_ns
+from echelon.bridge.cia402.wheel import Wheel
+from echelon.bridge.frame import WHEELS, Frame
 from echelon.can_plan import DrivePlan
 
 

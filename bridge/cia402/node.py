@@ -8,8 +8,8 @@
 from collections import Counter
 from collections.abc import Mapping
 
-from bridge.cia402 import objects
-from bridge.cia402.codec import (
+from echelon.bridge.cia402 import objects
+from echelon.bridge.cia402.codec import (
     HEARTBEAT_ID,
     HOST_NODE,
     NMT_ID,
@@ -24,11 +24,11 @@ from bridge.cia402.codec import (
     heartbeat,
     heartbeat_state,
 )
-from bridge.cia402.objects import Dictionary
-from bridge.cia402.pdo import COMMUNICATION, MAPPING, Pdo, check_change, pack, pdos
-from bridge.cia402.profile import Profile
-from bridge.cia402.sdo import LENGTH, Abort, Key, SdoError, SdoServer, abort_code
-from bridge.frame import Frame
+from echelon.bridge.cia402.objects import Dictionary
+from echelon.bridge.cia402.pdo import COMMUNICATION, MAPPING, Pdo, check_change, pack, pdos
+from echelon.bridge.cia402.profile import Profile
+from echelon.bridge.cia402.sdo import LENGTH, Abort, Key, SdoError, SdoServer, abort_code
+from echelon.bridge.frame import Frame
 from echelon.can_plan import NEVER_NS
 
 MS = 1_000_000

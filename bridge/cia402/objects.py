@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from bridge.cia402.codec import RPDO_IDS, TPDO_IDS
-from bridge.cia402.sdo import Abort, Key, SdoError
+from echelon.bridge.cia402.codec import RPDO_IDS, TPDO_IDS
+from echelon.bridge.cia402.sdo import Abort, Key, SdoError
 
 Value = int | str
 Live = Callable[[], int]

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from math import tau
 from typing import Final
 
-from bridge.cia402.codec import (
+from echelon.bridge.cia402.codec import (
     AUTOMATIC,
     EMCY_ID,
     HEARTBEAT_ID,
@@ -31,11 +31,11 @@ from bridge.cia402.codec import (
     rated_mnm,
     state_of,
 )
-from bridge.cia402.configuration import heartbeat_ns
-from bridge.cia402.objects import CONTROLWORD, TARGET_TORQUE
-from bridge.cia402.sdo import LENGTH, written
-from bridge.frame import WHEELS, Frame
-from bridge.observe import Finding, WheelReading
+from echelon.bridge.cia402.configuration import heartbeat_ns
+from echelon.bridge.cia402.objects import CONTROLWORD, TARGET_TORQUE
+from echelon.bridge.cia402.sdo import LENGTH, written
+from echelon.bridge.frame import WHEELS, Frame
+from echelon.bridge.observe import Finding, WheelReading
 from echelon.can_plan import DrivePlan, EnvelopePlan
 
 _LENGTHS: Final = {

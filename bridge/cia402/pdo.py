@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from bridge.cia402.objects import (
+from echelon.bridge.cia402.objects import (
     COB_ID,
     EVENT_TIMER,
     INHIBIT,
@@ -24,7 +24,7 @@ from bridge.cia402.objects import (
     TRANSMISSION,
     Dictionary,
 )
-from bridge.cia402.sdo import Abort, Key, SdoError
+from echelon.bridge.cia402.sdo import Abort, Key, SdoError
 
 SYNCHRONOUS_MAX = 240
 BY_ITSELF = (254, 255)

@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 
-from bridge.cia402.pdo import Pdo
-from bridge.cia402.sdo import Key
+from echelon.bridge.cia402.pdo import Pdo
+from echelon.bridge.cia402.sdo import Key
 
 
 class Profile(ABC):

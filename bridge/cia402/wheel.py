@@ -10,7 +10,7 @@ torques would mean something else there.
 
 from typing import Final
 
-from bridge.cia402.codec import (
+from echelon.bridge.cia402.codec import (
     EMCY_ID,
     HEARTBEAT_ID,
     MODE_CYCLIC_TORQUE,
@@ -37,9 +37,9 @@ from bridge.cia402.codec import (
     rated_mnm,
     state_of,
 )
-from bridge.cia402.configuration import steps
-from bridge.cia402.sdo import Abort, SdoClient, name
-from bridge.frame import Frame, recovers_after_ns
+from echelon.bridge.cia402.configuration import steps
+from echelon.bridge.cia402.sdo import Abort, SdoClient, name
+from echelon.bridge.frame import Frame, recovers_after_ns
 from echelon.can_plan import DrivePlan
 
 _FAULT = "fault"

@@ -44,8 +44,8 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
-from bridge.native.counter import COUNTERS
-from bridge.native.crc import crc8
+from echelon.bridge.native.counter import COUNTERS
+from echelon.bridge.native.crc import crc8
 
 BASE_ID = 0x100
 FEEDBACK_ID = 0x180

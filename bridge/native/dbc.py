@@ -8,7 +8,7 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
-from bridge.native.codec import (
+from echelon.bridge.native.codec import (
     BASE_ID,
     CLEAR,
     CLIPPED,

@@ -8,9 +8,9 @@ from collections import Counter
 from math import tau
 from typing import Final
 
-from bridge.frame import Frame
-from bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
-from bridge.native.codec import (
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
     STATUS_EVERY,
@@ -24,7 +24,7 @@ from bridge.native.codec import (
     encode_status,
     frame_id,
 )
-from bridge.native.counter import CounterCheck
+from echelon.bridge.native.counter import CounterCheck
 from echelon.can_plan import DrivePlan
 
 CODES: Final = {

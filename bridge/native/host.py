@@ -6,8 +6,8 @@ Pure: frames and the time in, frames out.  One command per cycle, whatever it sa
 from collections import Counter
 from typing import Final
 
-from bridge.frame import WHEELS, Frame, recovers_after_ns
-from bridge.native.codec import (
+from echelon.bridge.frame import WHEELS, Frame, recovers_after_ns
+from echelon.bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
     STATUS_ID,
@@ -19,7 +19,7 @@ from bridge.native.codec import (
     decode_status,
     frame_id,
 )
-from bridge.native.counter import CounterCheck
+from echelon.bridge.native.counter import CounterCheck
 from echelon.can_plan import NEVER_NS, DrivePlan
 
 SILENT: Final = "silent"

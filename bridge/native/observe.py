@@ -1,7 +1,7 @@
 """A passive listener to the native frames of one robot: what they say, and what must not be.  Pure."""
 
-from bridge.frame import WHEELS, Frame
-from bridge.native.codec import (
+from echelon.bridge.frame import WHEELS, Frame
+from echelon.bridge.native.codec import (
     BASE_ID,
     FEEDBACK_ID,
     STATUS_EVERY,
@@ -15,8 +15,8 @@ from bridge.native.codec import (
     decode_status,
     frame_id,
 )
-from bridge.native.counter import CounterCheck
-from bridge.observe import Finding, WheelReading
+from echelon.bridge.native.counter import CounterCheck
+from echelon.bridge.observe import Finding, WheelReading
 from echelon.can_plan import DrivePlan, EnvelopePlan
 
 

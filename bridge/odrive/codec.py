@@ -13,7 +13,7 @@ from enum import IntEnum, IntFlag, StrEnum
 from math import isfinite
 from typing import Any, Final, NamedTuple
 
-from bridge.odrive.enums import (
+from echelon.bridge.odrive.enums import (
     AxisError,
     AxisState,
     Command,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bridge.odrive.enums import Command
+from echelon.bridge.odrive.enums import Command
 from echelon.can_plan import DrivePlan
 
 _NS = 1_000_000

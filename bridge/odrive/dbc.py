@@ -7,11 +7,11 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
-from bridge.frame import WHEELS
-from bridge.odrive.codec import MESSAGES, frame_id
-from bridge.odrive.codec import Message as Layout
-from bridge.odrive.config import ODriveConfig
-from bridge.odrive.enums import Command
+from echelon.bridge.frame import WHEELS
+from echelon.bridge.odrive.codec import MESSAGES, frame_id
+from echelon.bridge.odrive.codec import Message as Layout
+from echelon.bridge.odrive.config import ODriveConfig
+from echelon.bridge.odrive.enums import Command
 from echelon.can_plan import DrivePlan
 
 HOST = "bridge"

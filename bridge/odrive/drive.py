@@ -13,11 +13,11 @@ Where fw 0.6 is closed and undocumented, this follows 0.5.6, or `ODriveConfig` h
 from collections import Counter
 from typing import Final
 
-from bridge.frame import Frame
-from bridge.motor import ON_DEMAND, Fault, Motor
-from bridge.odrive.codec import BROADCAST, MAX_NODE, MESSAGES, ZERO_TORQUE, Refusal, frame_id
-from bridge.odrive.config import ODriveConfig
-from bridge.odrive.enums import (
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import ON_DEMAND, Fault, Motor
+from echelon.bridge.odrive.codec import BROADCAST, MAX_NODE, MESSAGES, ZERO_TORQUE, Refusal, frame_id
+from echelon.bridge.odrive.config import ODriveConfig
+from echelon.bridge.odrive.enums import (
     AxisError,
     AxisState,
     Command,

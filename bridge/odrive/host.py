@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
-from bridge.frame import WHEELS, Frame, recovers_after_ns
-from bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
-from bridge.odrive.enums import AxisState, Command, ControlMode, InputMode, error_names
+from echelon.bridge.frame import WHEELS, Frame, recovers_after_ns
+from echelon.bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
+from echelon.bridge.odrive.enums import AxisState, Command, ControlMode, InputMode, error_names
 from echelon.can_plan import DrivePlan
 
 RETRY_NS: Final = 200_000_000

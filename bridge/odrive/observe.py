@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from math import tau
 from typing import Final
 
-from bridge.frame import Frame
-from bridge.observe import Finding, WheelReading
-from bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
-from bridge.odrive.config import ODriveConfig
-from bridge.odrive.enums import AxisState, Command, error_names
+from echelon.bridge.frame import Frame
+from echelon.bridge.observe import Finding, WheelReading
+from echelon.bridge.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
+from echelon.bridge.odrive.config import ODriveConfig
+from echelon.bridge.odrive.enums import AxisState, Command, error_names
 from echelon.can_plan import DrivePlan, EnvelopePlan
 
 ROUNDING: Final = 1e-6

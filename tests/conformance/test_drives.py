@@ -13,15 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.cia402.codec import HOST_NODE, SYNC_ID, Nmt, heartbeat
-from bridge.cia402.drive import Cia402Drive
-from bridge.cia402.host import Cia402Host
-from bridge.frame import Drive, Frame, Host
-from bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
-from bridge.native.drive import NativeDrive
-from bridge.native.host import NativeHost
-from bridge.odrive.drive import ODriveDrive
-from bridge.odrive.host import ODriveHost
+from echelon.bridge.cia402.codec import HOST_NODE, SYNC_ID, Nmt, heartbeat
+from echelon.bridge.cia402.drive import Cia402Drive
+from echelon.bridge.cia402.host import Cia402Host
+from echelon.bridge.frame import Drive, Frame, Host
+from echelon.bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.native.drive import NativeDrive
+from echelon.bridge.native.host import NativeHost
+from echelon.bridge.odrive.drive import ODriveDrive
+from echelon.bridge.odrive.host import ODriveHost
 from echelon.can_plan import DrivePlan
 from tests.bench_drives import MS, drive_plan, motor_plan
 

@@ -11,11 +11,11 @@ import canopen
 import pytest
 from canopen.profiles.p402 import State402
 
-from bridge import cia402
-from bridge.bus import open_bus
-from bridge.cia402.drive import Cia402Drive
-from bridge.cia402.host import Cia402Host, Master
-from bridge.frame import Frame
+from echelon.bridge import cia402
+from echelon.bridge.bus import open_bus
+from echelon.bridge.cia402.drive import Cia402Drive
+from echelon.bridge.cia402.host import Cia402Host, Master
+from echelon.bridge.frame import Frame
 from tests.bench_drives import MS, Bench, drive_plan, motor_plan
 
 pytestmark = pytest.mark.vcan

@@ -14,10 +14,10 @@ from typing import Any
 import cantools
 import pytest
 
-from bridge.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
+from echelon.bridge.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
 from echelon.load import load
-from sim.live import Display
-from sim.run import execute
+from echelon.sim.live import Display
+from echelon.sim.run import execute
 from tests.vcan.test_vcan import ip, listener, next_frame, somebody_listens
 
 pytestmark = pytest.mark.vcan

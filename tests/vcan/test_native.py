@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from bridge.bus import open_bus
-from bridge.frame import Frame
-from bridge.motor import Fault
-from bridge.native.codec import FaultCode, Feedback, NativeCodec, WheelState
-from bridge.native.drive import NativeDrive
-from bridge.native.host import NativeHost
+from echelon.bridge.bus import open_bus
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, WheelState
+from echelon.bridge.native.drive import NativeDrive
+from echelon.bridge.native.host import NativeHost
 from tests.bench_drives import MS, Bench, drive_plan
 from tests.runs import lab_dbc
 

@@ -15,11 +15,11 @@ from can.interfaces.socketcan import SocketcanBus
 from odrive_can.mock import ODriveCANMock
 from odrive_can.odrive import CanMsg, DriveError, ODriveCAN
 
-from bridge.bus import open_bus
-from bridge.frame import Frame
-from bridge.motor import Fault
-from bridge.odrive.drive import ODriveDrive
-from bridge.odrive.host import ODriveHost
+from echelon.bridge.bus import open_bus
+from echelon.bridge.frame import Frame
+from echelon.bridge.motor import Fault
+from echelon.bridge.odrive.drive import ODriveDrive
+from echelon.bridge.odrive.host import ODriveHost
 from tests.bench_drives import MS, Bench, drive_plan
 
 pytestmark = pytest.mark.vcan

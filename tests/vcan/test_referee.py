@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bridge.bus import open_bus
+from echelon.bridge.bus import open_bus
 from echelon.cli import main
 from tests.live_robot import TORQUES, LiveRobot, one_robot
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from bench.can import bus_rates
-from bridge.bridge import Bridge, Frame
-from bridge.bus import Bus, open_bus
-from bridge.bus_url import listen_command, resolve_url
-from bridge.native.codec import NativeCodec, Torque
-from sim.can_checks import check_interfaces, check_vcan
+from echelon.bridge.bridge import Bridge, Frame
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import listen_command, resolve_url
+from echelon.bridge.native.codec import NativeCodec, Torque
+from echelon.sim.can_checks import check_interfaces, check_vcan
 from tests.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan

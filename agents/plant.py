@@ -14,11 +14,14 @@ Both steps are pure functions on floats.  They run inside the torque loop, thous
 they are written out and not in arrays.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from math import ceil, cos, isfinite, nan, sin, sqrt
 from typing import Final, NamedTuple
 
 from echelon.plan import RobotPlan
+from echelon.plugins import PartRunError, Plugin
 
 _INNER: Final = (1 - sqrt(1 / 5)) / 2
 """The Gauss-Lobatto rule with four points has its inner ones here and at 1 - here, weights 1/12, 5/12, 5/12, 1/12: exact
@@ -130,15 +133,78 @@ def rigid_body_step(robot: RobotPlan) -> Step:
     return step
 
 
-PLANTS: Final = {"paper": paper_step, "rigid_body": rigid_body_step}
+class Plant(Plugin, ABC):
+    """Base of all plants; the fields of a class are its parameters.
 
+    A step is a pure function.  Where numbers run away it may raise ValueError or OverflowError, as the functions of `math` do:
+    the robot is lost then."""
+
+    @abstractmethod
+    def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
+        """Returns the state after h [s] under held wheel torques [N m]; make it with `state_at`."""
+
+    def step_of(self, robot: RobotPlan) -> Step:
+        """Returns the step of one robot; to be overridden where something can be computed once per robot."""
+        return partial(self.step, robot)
+
+
+class Paper(Plant):
+    """The paper's equations."""
+
+    def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
+        """Returns the state after h of held torque, exactly but for the quadrature of v e_v."""
+        return paper_step(robot)(state, tau_right, tau_left, h)
+
+    def step_of(self, robot: RobotPlan) -> Step:
+        """Returns the step of one robot."""
+        return paper_step(robot)
+
+
+class RigidBody(Plant):
+    """A rigid body with its mass at the reference point."""
+
+    def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
+        """Returns the state after h of held torque."""
+        return rigid_body_step(robot)(state, tau_right, tau_left, h)
+
+    def step_of(self, robot: RobotPlan) -> Step:
+        """Returns the step of one robot."""
+        return rigid_body_step(robot)
+
+
+PLANTS: Final[dict[str, type[Plugin]]] = {"paper": Paper, "rigid_body": RigidBody}
+"""What is built in, by name."""
 
 LOST: Final = RobotState(nan, nan, nan, nan, nan, nan, nan)
 """The state of a robot whose numbers ran away."""
+_HUGE: Final = 1e12
+"""Where a plant that others wrote may fail because its numbers ran away"""
 
 
 def make_step(robot: RobotPlan) -> Step:
-    """Returns the step of the plant that a robot's plan names.  Raises ValueError on an unknown one."""
-    if robot.model not in PLANTS:
-        raise ValueError(f"model {robot.model!r}: must be one of {', '.join(PLANTS)}")
-    return PLANTS[robot.model](robot)
+    """Returns the step of the plant that a robot's plan names; one that is not built in has its answers checked."""
+    plant: Plant = robot.model.made
+    step = plant.step_of(robot)
+    return step if robot.model.is_own else _checked(step, f"{robot.model.use} of {robot.name}")
+
+
+def _checked(step: Step, who: str) -> Step:
+    """Returns a step that raises PartRunError if, for numbers that a robot can have, it raises or returns anything but a state
+    of finite numbers."""
+
+    def checked(state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
+        given = (*state, tau_right, tau_left)
+        lost = not all(abs(number) < _HUGE for number in given)
+        try:
+            after = step(state, tau_right, tau_left, h)
+        except Exception as error:
+            if lost and isinstance(error, (ValueError, OverflowError)):
+                raise
+            raise PartRunError(f"{who}: step raised {type(error).__name__}: {error}") from error
+        if not isinstance(after, RobotState):
+            raise PartRunError(f"{who}: step must return a RobotState (state_at), not {after!r:.60}")
+        if not lost and not all(map(isfinite, after)):
+            raise PartRunError(f"{who}: step is not finite: {after}")
+        return after
+
+    return checked

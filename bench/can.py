@@ -25,10 +25,11 @@ from echelon.bridge.bus_url import resolve_url
 from echelon.bridge.commander import Torques
 from echelon.bridge.frame import Frame
 from echelon.bridge.protocols import drive_places, make_drive
-from echelon.load import effective_toml, load
+from echelon.load import effective_toml
 from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan import Plan
 from echelon.sim.engine import Engine
+from echelon.sim.parts import load
 from echelon.sim.supervisor import Supervisor
 from echelon.sim.usage import SCENARIOS
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from echelon.bridge.bus_url import resolve_url
-from echelon.load import effective_toml, load
+from echelon.load import effective_toml
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display
+from echelon.sim.parts import load
 from echelon.sim.run import execute
 from echelon.sim.supervisor import Supervisor
 from echelon.sim.usage import SCENARIOS

@@ -1,33 +1,43 @@
 """Desired trajectories of the centroid, z_cd(t), with their first two derivatives.
 
 A trajectory is a function of time [s] that returns position [m], velocity [m/s] and acceleration [m/s²] as one (3, 2)
-array.  To add one: write a class with `at`, enter it in `TRAJECTORIES`, and give `echelon.scenario` a table of its keys.
+array.  To add one, derive a class from `Trajectory` (echelon.plugins).
 """
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
 from math import cos, sin
-from typing import Final, Protocol
+from typing import Annotated, Any, Final, Protocol, Self
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from echelon.plan import Array, TrajectoryPlan
+from echelon.plan import Array
+from echelon.plugins import Part, PartRunError, Plugin
+from echelon.values import Finite, NonNegative, Point, Positive
 
-Point = tuple[float, float]
+
+class Trajectory(Plugin, ABC):
+    """Base of all trajectories; the fields of a class are its parameters."""
+
+    @abstractmethod
+    def at(self, t: float) -> Array:
+        """Returns z_cd [m], ż_cd [m/s] and z̈_cd [m/s²] at t [s], (3, 2)."""
 
 
-class Trajectory(Protocol):
+class Desired(Protocol):
     """What a node asks of a trajectory."""
 
     def at(self, t: float) -> Array:
-        """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
+        """Returns z_cd [m], ż_cd [m/s] and z̈_cd [m/s²] at t [s], (3, 2)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(Trajectory):
     """z_cd = start + velocity t"""
 
-    start: Point
+    start: Point = (0.0, 0.0)
+    """[m]"""
     velocity: Point
+    """[m/s]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -35,14 +45,17 @@ class Line:
         return np.array([[x + vx * t, y + vy * t], [vx, vy], [0.0, 0.0]])
 
 
-@dataclass(frozen=True, slots=True)
-class Circle:
+class Circle(Trajectory):
     """z_cd = centre + radius (cos φ, sin φ), φ = rate t + phase"""
 
-    centre: Point
-    radius: float
-    rate: float
-    phase: float
+    centre: Point = (0.0, 0.0)
+    """[m]"""
+    radius: Positive
+    """[m]"""
+    rate: Finite
+    """[rad/s]"""
+    phase: Finite = 0.0
+    """[rad]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -53,14 +66,17 @@ class Circle:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Sine:
+class Sine(Trajectory):
     """z_cd = start + (speed t, amplitude sin(rate t)): the paper's, with speed 1, amplitude 30, rate 0.1"""
 
-    start: Point
-    speed: float
-    amplitude: float
-    rate: float
+    start: Point = (0.0, 0.0)
+    """[m]"""
+    speed: Finite
+    """[m/s]"""
+    amplitude: Finite
+    """[m]"""
+    rate: Finite
+    """[rad/s]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -74,8 +90,7 @@ class Sine:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Waypoints:
+class Waypoints(Trajectory):
     """Straight from point to point, at rest in each, with least jerk in between: over a leg from q to p,
 
     z_cd = q + (p - q)(10 s³ - 15 s⁴ + 6 s⁵),   s = (t - t_q)/(t_p - t_q) in [0, 1].
@@ -83,8 +98,18 @@ class Waypoints:
     Before the first time and after the last it rests.
     """
 
-    points: tuple[Point, ...]
-    times: tuple[float, ...]
+    points: Annotated[list[Point], Field(min_length=2)]
+    """[m]"""
+    times: Annotated[list[NonNegative], Field(min_length=2)]
+    """When to be at each point [s], ascending"""
+
+    @model_validator(mode="after")
+    def _times(self) -> Self:
+        if len(self.times) != len(self.points):
+            raise ValueError(f"{len(self.points)} points need as many times, not {len(self.times)}")
+        if any(late <= early for early, late in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("times must ascend, and no two be equal")
+        return self
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -98,17 +123,35 @@ class Waypoints:
         return np.array([q + (p - q) * ratio, (p - q) * rate, (p - q) * bend])
 
 
-TRAJECTORIES: Final = {"line": Line, "circle": Circle, "sine": Sine, "waypoints": Waypoints}
+TRAJECTORIES: Final[dict[str, type[Plugin]]] = {"line": Line, "circle": Circle, "sine": Sine, "waypoints": Waypoints}
+"""What is built in, by name."""
 
 
-def make_trajectory(plan: TrajectoryPlan) -> Trajectory:
-    """Returns the trajectory that a plan names.  Raises ValueError on an unknown kind."""
-    if plan.kind not in TRAJECTORIES:
-        raise ValueError(f"trajectory {plan.kind!r}: must be one of {', '.join(TRAJECTORIES)}")
-    trajectory: Trajectory = TRAJECTORIES[plan.kind](**plan.parameters)
-    return trajectory
+class _Checked:
+    """A trajectory that others wrote, each of its answers checked."""
+
+    def __init__(self, part: Part[Trajectory]) -> None:
+        self._part = part
+
+    def at(self, t: float) -> Array:
+        """Returns the trajectory's answer.  Raises PartRunError if it raises, or gives anything but six finite numbers."""
+        try:
+            answer = np.asarray(self._part.made.at(t), dtype=np.float64)
+        except Exception as error:
+            raise PartRunError(f"{self._part.use}: at({t:g}) raised {type(error).__name__}: {error}") from error
+        if answer.shape != (3, 2):
+            raise PartRunError(f"{self._part.use}: at({t:g}) has the shape {answer.shape}, not (3, 2)")
+        if not np.isfinite(answer).all():
+            raise PartRunError(f"{self._part.use}: at({t:g}) is not finite: {answer.tolist()}")
+        return answer
 
 
-def sample(trajectory: Trajectory, times: Array) -> Array:
+def make_trajectory(part: Part[Any]) -> Desired:
+    """Returns the trajectory of a plan; one that is not built in has its answers checked."""
+    trajectory: Trajectory = part.made
+    return trajectory if part.is_own else _Checked(part)
+
+
+def sample(trajectory: Desired, times: Array) -> Array:
     """Returns the trajectory at many instants [s], (T, 3, 2)."""
     return np.array([trajectory.at(t) for t in times.tolist()]).reshape(-1, 3, 2)

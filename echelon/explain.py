@@ -11,17 +11,19 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, Tag
 from pydantic_core import ErrorDetails
 
-from echelon.scenario import Scenario
-
 TEXTS: Final = {
     "float_type": "must be a number",
+    "float_parsing": "must be a number",
     "int_type": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "int_from_float": "must be a whole number",
     "finite_number": "must be a finite number",
     "greater_than": "must be greater than {gt}",
     "greater_than_equal": "must be at least {ge}",
     "less_than": "must be less than {lt}",
     "less_than_equal": "must be at most {le}",
     "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
     "string_type": "must be a string",
     "string_unicode": "must be a string of Unicode characters",
     "list_type": "must be an array",
@@ -46,8 +48,32 @@ class Mistake:
     text: str
 
 
-def explain(errors: Sequence[ErrorDetails]) -> Mistake:
-    """Returns the mistake to show first: an unknown key before the missing one that it may be meant to be."""
+class PartError(ValueError):
+    """A scenario names a part (echelon.plugins) that cannot be had, or gives it wrong parameters.
+
+    `keys` lead from the part's place in the scenario to what is wrong.  `errors` are those of pydantic, if it is a parameter of
+    `model`; otherwise `text` says what is wrong with the value `shown`."""
+
+    def __init__(
+        self,
+        text: str,
+        keys: tuple[str, ...] = (),
+        shown: Any = None,
+        errors: Sequence[ErrorDetails] = (),
+        model: type[BaseModel] | None = None,
+    ) -> None:
+        super().__init__(text)
+        self.text, self.keys, self.shown, self.errors, self.model = text, keys, shown, errors, model
+
+    def at(self, *keys: str, shown: Any = None) -> "PartError":
+        """Returns the same mistake at other keys."""
+        return PartError(self.text, keys, shown, self.errors, self.model)
+
+
+def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[str | int, ...] = ()) -> Mistake:
+    """Returns the mistake to show first: an unknown key before the missing one that it may be meant to be.
+
+    `root` is the model that was validated, `above` are the keys that lead to it in the file."""
     first = errors[0]
     if first["type"] == "missing":
         same_table = [e for e in errors if e["type"] == "extra_forbidden" and e["loc"][:-1] == first["loc"][:-1]]
@@ -56,9 +82,12 @@ def explain(errors: Sequence[ErrorDetails]) -> Mistake:
     if kind.startswith("recursion"):
         return Mistake(("formation",), "formation: groups are nested too deep")
     if kind.startswith("string") and location[-1] == "[key]":  # not a value is wrong, but the key before it
-        keys, _ = _walk(location[:-1])
+        keys = above + _walk(location[:-1], root)[0]
         return Mistake(keys, f"{key_text(keys)}: {NAME_RULE}")
-    keys, annotation = _walk(location)
+    keys, annotation = _walk(location, root)
+    keys = above + keys
+    if kind == "value_error" and isinstance(part := first["ctx"]["error"], PartError):
+        return _of_part(part, keys)
     if kind == "extra_forbidden":
         return Mistake(keys, f"{key_text(keys)}: {_unknown(str(keys[-1]), annotation)}")
     if kind in ("union_tag_invalid", "union_tag_not_found"):  # of a table that says its `kind`
@@ -71,6 +100,14 @@ def explain(errors: Sequence[ErrorDetails]) -> Mistake:
     text = PAIR_RULE if kind == "tuple_type" else _text(first, annotation)
     shown = "" if kind in ("missing", "value_error") else f" = {value_text(value)}"
     return Mistake(keys, f"{key_text(keys)}{shown}: {text}")
+
+
+def _of_part(mistake: PartError, keys: tuple[str | int, ...]) -> Mistake:
+    keys += mistake.keys
+    if mistake.model is not None:
+        return explain(mistake.errors, mistake.model, keys)
+    shown = "" if mistake.shown is None else f" = {value_text(mistake.shown)}"
+    return Mistake(keys, f"{key_text(keys)}{shown}: {mistake.text}")
 
 
 def _text(error: ErrorDetails, annotation: Any) -> str:
@@ -110,14 +147,14 @@ def _unknown(key: str, model: Any) -> str:
     return f"unknown key; did you mean {close[0]!r}?" if close else f"unknown key; known here: {', '.join(known)}"
 
 
-def _walk(location: Sequence[str | int]) -> tuple[tuple[str | int, ...], Any]:
-    """Follows a location of pydantic's through the scenario's types.
+def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ...], Any]:
+    """Follows a location of pydantic's through the types of a model.
 
     Returns the parts of it that are keys of the file, for some only name the member of a union; and the type it leads
     to.  A location that ends with an unknown key leads to the type of its table.
     """
     keys: list[str | int] = []
-    annotation: Any = Scenario
+    annotation: Any = root
     for at, part in enumerate(location, start=1):
         if members := _members(annotation):
             member = members[str(part)]

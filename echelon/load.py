@@ -10,8 +10,10 @@ import tomlkit
 from pydantic import ValidationError
 
 from echelon.explain import explain, key_text, one_line, short
+from echelon.part_fields import PartContext
 from echelon.plan import Plan
 from echelon.planning import PlanError, make_plan
+from echelon.plugins import Registry
 from echelon.scenario import Scenario
 
 
@@ -22,8 +24,10 @@ class ScenarioError(Exception):
         super().__init__(one_line(text))
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
-    """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError."""
+def load(path: Path, overrides: Sequence[str], registry: Registry) -> tuple[Scenario, Plan]:
+    """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError.
+
+    The scenario's parts come from `registry`; `echelon.sim.parts.load` has one."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -32,11 +36,12 @@ def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
         raise ScenarioError(f"{path}: {error.strerror}") from None
     except ValueError as error:  # a path with a zero byte
         raise ScenarioError(f"{path}: {error}") from None
-    return parse(text, str(path), overrides)
+    return parse(text, str(path), overrides, registry, path.parent)
 
 
-def parse(text: str, name: str, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
-    """Makes a scenario and its plan of TOML text; `name` stands for the file in messages.  Raises ScenarioError."""
+def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, folder: Path) -> tuple[Scenario, Plan]:
+    """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, parts in files are looked for in
+    `folder`.  Raises ScenarioError."""
     table = _table(text, name)
     if not table and not overrides:
         needed = [key for key, field in Scenario.model_fields.items() if field.is_required()]
@@ -52,10 +57,10 @@ def parse(text: str, name: str, overrides: Sequence[str] = ()) -> tuple[Scenario
         return ScenarioError(f"{name}{_overridden(keys, changed)}: {text}")
 
     try:
-        scenario = Scenario.model_validate(table)
-        return scenario, make_plan(scenario)
+        scenario = Scenario.model_validate(table, context=PartContext(registry, folder))
+        return scenario, make_plan(scenario, registry)
     except ValidationError as error:
-        found = explain(error.errors(include_url=False))
+        found = explain(error.errors(include_url=False), Scenario)
         raise mistake(key_text(found.keys), found.text) from None
     except PlanError as error:
         raise mistake(str(error).split(" = ")[0].split(":")[0], str(error)) from None

@@ -3,21 +3,24 @@
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from math import isfinite, radians
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
 from echelon import shapes
 from echelon.can_plan import CanPlan
 from echelon.drives import DriveMaker, make_can
 from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
+from echelon.plugins import Part, Registry
 from echelon.scenario import Group, RobotTable, Scenario, Shape
+from echelon.values import Table
 
 ROBOT_DEFAULTS: Final[dict[str, Any]] = {
-    "model": "paper",
     "heading": 0.0,
     "torque_limit": float("inf"),
     "torque_rate_limit": float("inf"),
     "wheel_speed_limit": float("inf"),
 }
+DEFAULT_PLANT: Final = "paper"
 NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
 """What must be said of every robot, on some level."""
 MAX_ROBOTS: Final = 127
@@ -34,7 +37,7 @@ def nanoseconds(seconds: float, key: str) -> int:
     return round(exact)
 
 
-def make_members(scenario: Scenario) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...], CanPlan]:
+def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...], CanPlan]:
     """Returns robots and nodes by their numbers, and the buses that the robots' drives are on.  Raises PlanError."""
     count = _count_robots(scenario.formation)
     if count > MAX_ROBOTS:
@@ -47,6 +50,7 @@ def make_members(scenario: Scenario) -> tuple[tuple[RobotPlan, ...], tuple[NodeP
         first_node=count,
         drives=DriveMaker(scenario.can, can),
         closed=can.closed,
+        default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
     return tuple(walk.robots), tuple(walk.nodes), can
@@ -80,9 +84,17 @@ class _Place:
 class _Walk:
     """One walk through the tree; robots are numbered when they are met, nodes after all that is below them."""
 
-    def __init__(self, acceleration_ns: int, torque_ns: int, first_node: int, drives: DriveMaker, closed: bool) -> None:
+    def __init__(
+        self,
+        acceleration_ns: int,
+        torque_ns: int,
+        first_node: int,
+        drives: DriveMaker,
+        closed: bool,
+        default_plant: Part[Any],
+    ) -> None:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
-        self._drives, self._closed = drives, closed
+        self._drives, self._closed, self._default_plant = drives, closed, default_plant
         self.robots: list[RobotPlan] = []
         self.nodes: list[NodePlan] = []
 
@@ -128,7 +140,7 @@ class _Walk:
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True)
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model"})
         for needed in NEEDED:
             if needed not in values:
                 raise PlanError(f"{place.key}.{needed}: missing (neither here, nor in its group, nor in [robot])")
@@ -151,16 +163,24 @@ class _Walk:
             child_number=place.child_number,
             period_ns=period_ns,
             torque_period_ns=self._torque_ns,
+            model=table.model or self._default_plant,
             **values,
         )
 
 
-def _overlaid(table: RobotTable, over: RobotTable) -> RobotTable:
-    """Returns a table with what another says in its place, key by key in the tables within."""
-    merged = table.model_dump(exclude_none=True)
-    for key, value in over.model_dump(exclude_none=True).items():
-        merged[key] = merged.get(key, {}) | value if isinstance(value, dict) else value
-    return RobotTable(**merged)
+_T = TypeVar("_T", bound=Table)
+
+
+def _overlaid(table: _T, over: _T) -> _T:
+    """Returns a table with what another says in its place, key by key, in the tables within it too."""
+    merged = {}
+    for key in type(table).model_fields:
+        below, above = getattr(table, key), getattr(over, key)
+        if isinstance(below, Table) and isinstance(above, Table):
+            merged[key] = _overlaid(below, above)
+        else:
+            merged[key] = below if above is None else above
+    return table.model_copy(update=merged)
 
 
 def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:

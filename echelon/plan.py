@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from echelon.can_plan import DISTURBANCES, NEVER_NS, CanPlan, DrivePlan, EnvelopePlan, EventPlan, StationPlan
 from echelon.messages import Channel
+from echelon.plugins import Part
 
 Array = NDArray[np.float64]
 COORDINATOR = "coordinator"
@@ -31,7 +32,8 @@ class RobotPlan:
     path: str
     parent: int
     child_number: int
-    model: str
+    model: Part[Any]
+    """An agents.plant.Plant"""
     mass: float
     inertia: float
     wheel_radius: float
@@ -117,14 +119,6 @@ class BlockPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class TrajectoryPlan:
-    """The desired trajectory of the centroid: a kind and its parameters (controller.trajectory)."""
-
-    kind: str
-    parameters: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
 class AvoidancePlan:
     """Collision avoidance: radii r_a < R_s [m], cap of one pair's force [m/s²]; `enabled` False only watches r_a."""
 
@@ -184,7 +178,8 @@ class Plan:
     """K̄ of all blocks, (2N, 2N), zero on the diagonal blocks."""
     lead: float
     """How far ahead the law looks, in periods of its node (controller.law)."""
-    trajectory: TrajectoryPlan
+    trajectory: Part[Any]
+    """Of the centroid: a controller.trajectory.Trajectory"""
     avoidance: AvoidancePlan
     links: tuple[LinkPlan, ...]
     can: CanPlan

@@ -25,8 +25,8 @@ from echelon.plan import (
     Plan,
     PlanError,
     RobotPlan,
-    TrajectoryPlan,
 )
+from echelon.plugins import Registry
 from echelon.scenario import LinkRule, Scenario, Uniform
 from echelon.values import path_matches
 
@@ -36,9 +36,9 @@ SHOWN_NAMES: Final = 12
 """How many members a message lists."""
 
 
-def make_plan(scenario: Scenario) -> Plan:
-    """Returns the plan of a scenario.  Raises PlanError."""
-    robots, nodes, can = make_members(scenario)
+def make_plan(scenario: Scenario, registry: Registry) -> Plan:
+    """Returns the plan of a scenario; parts that it does not name come from `registry`.  Raises PlanError."""
+    robots, nodes, can = make_members(scenario, registry)
     stations = _stations(robots, nodes, can)
     _check_starts(robots, scenario.avoidance.avoidance_radius if scenario.avoidance.enabled else 0.0)
     duration_ns = nanoseconds(scenario.duration, "duration")
@@ -59,7 +59,7 @@ def make_plan(scenario: Scenario) -> Plan:
         blocks=blocks,
         coupling=make_coupling(scenario.law, blocks),
         lead=scenario.law.lead,
-        trajectory=TrajectoryPlan(scenario.trajectory.kind, scenario.trajectory.model_dump(exclude={"kind"})),
+        trajectory=scenario.trajectory,
         avoidance=AvoidancePlan(**scenario.avoidance.model_dump()),
         links=_links(scenario.links, robots, nodes, stations, can),
         can=can,

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
+from echelon.part_fields import PlantField, TrajectoryField
 from echelon.values import (
     CouplingGain,
     Finite,
@@ -47,8 +48,8 @@ class Periods(Table):
 class RobotTable(Table):
     """A robot, or what all robots of a level have in common (theory.md section 1)."""
 
-    model: Literal["paper", "rigid_body"] | None = None
-    """Plant: the paper's equations, or a rigid body with its mass at the reference point."""
+    model: PlantField = None
+    """Plant: `paper` (the paper's equations), `rigid_body` (its mass at the reference point), or another (echelon.plugins)"""
     mass: Positive | None = None
     """m1 [kg]"""
     inertia: Positive | None = None
@@ -125,56 +126,6 @@ class Group(Table):
         if len(self.robots) + len(self.groups) > 1 and self.shape is None:
             raise ValueError("a group of several children needs a shape")
         return self
-
-
-class Line(Table):
-    """z_cd = start + velocity t"""
-
-    kind: Literal["line"]
-    start: Point = (0.0, 0.0)
-    velocity: Point
-
-
-class Circle(Table):
-    """z_cd = centre + radius (cos, sin)(rate t + phase)"""
-
-    kind: Literal["circle"]
-    centre: Point = (0.0, 0.0)
-    radius: Positive
-    rate: Finite
-    """[rad/s]"""
-    phase: Finite = 0.0
-    """[rad]"""
-
-
-class Sine(Table):
-    """z_cd = start + (speed t, amplitude sin(rate t)); the paper's"""
-
-    kind: Literal["sine"]
-    start: Point = (0.0, 0.0)
-    speed: Finite
-    amplitude: Finite
-    rate: Finite
-
-
-class Waypoints(Table):
-    """From point to point in straight lines, at rest in each, with the smoothest timing (least jerk) in between."""
-
-    kind: Literal["waypoints"]
-    points: Annotated[list[Point], Field(min_length=2)]
-    times: Annotated[list[NonNegative], Field(min_length=2)]
-    """When to be at each point [s], ascending"""
-
-    @model_validator(mode="after")
-    def _times(self) -> "Waypoints":
-        if len(self.times) != len(self.points):
-            raise ValueError(f"{len(self.points)} points need as many times, not {len(self.times)}")
-        if any(late <= early for early, late in zip(self.times, self.times[1:], strict=False)):
-            raise ValueError("times must ascend, and no two be equal")
-        return self
-
-
-Trajectory = Annotated[Line | Circle | Sine | Waypoints, Field(discriminator="kind")]
 
 
 class Gains(Table):
@@ -298,7 +249,8 @@ class Scenario(Table):
     """What all robots have in common"""
     formation: Group
     """The root of the tree"""
-    trajectory: Trajectory
+    trajectory: TrajectoryField
+    """Of the centroid: `line`, `circle`, `sine` or `waypoints` with their parameters (controller.trajectory), or another"""
     law: Law = Law()
     avoidance: Avoidance = Avoidance()
     links: list[LinkRule] = []

@@ -18,9 +18,10 @@ from echelon.bridge.bus_url import interface_is_up, resolve_url
 from echelon.bridge.closed import LOG
 from echelon.bridge.frame import Frame
 from echelon.bridge.referee import Referee, judge_log, read_run_log
-from echelon.load import ScenarioError, parse
+from echelon.load import ScenarioError
 from echelon.plan import Plan
 from echelon.sim.can_table import CanTable, finding_text
+from echelon.sim.parts import parse
 from echelon.sim.usage import UsageError, scenario_of
 
 TICK_S: Final = 0.1
@@ -200,7 +201,7 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Plan, Path | None]:
         raise UsageError(f"--set {arguments.set[0]}: is for a scenario; {folder} is the folder of a run that has been")
     path = folder / "scenario.toml"
     try:
-        return parse(path.read_text(encoding="utf-8"), str(path))[1], folder
+        return parse(path.read_text(encoding="utf-8"), str(path), (), folder)[1], folder
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except (ScenarioError, ValueError) as error:

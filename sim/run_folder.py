@@ -9,8 +9,9 @@ import cantools
 
 from echelon.bridge.canlog import Logged, read_log
 from echelon.bridge.plan_dbc import plan_dbc
-from echelon.load import ScenarioError, parse
+from echelon.load import ScenarioError
 from echelon.plan import Plan
+from echelon.sim.parts import parse
 from echelon.sim.recording import read_trace
 from echelon.sim.report import RunForReport, write_report
 from echelon.sim.usage import UsageError
@@ -24,7 +25,7 @@ def read_run(folder: Path) -> RunForReport:
     try:
         toml = (folder / "scenario.toml").read_text(encoding="utf-8")
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        _, plan = parse(toml, str(folder / "scenario.toml"))
+        _, plan = parse(toml, str(folder / "scenario.toml"), (), folder)
         trace = read_trace(folder / "run.mcap", plan)
     except OSError as error:
         raise UsageError(f"{error.filename}: {error.strerror}") from None

@@ -3,9 +3,10 @@
 import argparse
 from pathlib import Path
 
-from echelon.load import ScenarioError, load
+from echelon.load import ScenarioError
 from echelon.plan import Plan
 from echelon.scenario import Scenario
+from echelon.sim.parts import load
 
 SCENARIOS = Path(__file__).parent.parent / "deploy" / "scenarios"
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from echelon.load import load
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
+from echelon.sim.parts import load
 
 ROOT = Path(__file__).parents[1]
 METADATA = {"version": "0.1.0", "host": "any"}

@@ -12,8 +12,8 @@ from echelon.bridge.bus import open_bus
 from echelon.bridge.cia402.host import Master
 from echelon.bridge.frame import Frame
 from echelon.bridge.protocols import drive_places, make_drive, make_host
-from echelon.load import load
 from echelon.plan import Plan
+from echelon.sim.parts import load
 from tests.bench_drives import Bench
 from tests.trees import ROBOT, scenario
 

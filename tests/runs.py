@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from echelon.load import load
 from echelon.plan import Plan
 from echelon.sim.engine import Engine
+from echelon.sim.parts import load
 from echelon.sim.trace import Trace, TraceBuilder
 
 ROOT = Path(__file__).resolve().parent.parent

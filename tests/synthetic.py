@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.link import LinkCounts
-from echelon.load import load
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Plan
 from echelon.scenario import Scenario
+from echelon.sim.parts import load
 from echelon.sim.trace import Trace
 
 PAPER = Path(__file__).parent.parent / "deploy" / "scenarios" / "paper.toml"

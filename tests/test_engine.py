@@ -10,13 +10,13 @@ from synthetic import PAPER
 
 from echelon.controller.law import CentralLaw
 from echelon.controller.sampled import spectral_radius
-from echelon.load import load
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Array, Plan
 from echelon.sim.blocks import block_series
 from echelon.sim.distances import distances
 from echelon.sim.engine import Engine
 from echelon.sim.measures import claim_rows
+from echelon.sim.parts import load
 from echelon.sim.trace import Trace, TraceBuilder
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}

@@ -13,8 +13,8 @@ from trees import PAPER_TREE, plan_of, random_epsilon, random_law, scenario, tre
 
 from echelon.controller.law import BlockGains, CentralLaw
 from echelon.controller.potential import PairForces, pairs_between
-from echelon.load import load
 from echelon.plan import Array, AvoidancePlan, Plan
+from echelon.sim.parts import load
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -13,7 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from echelon.explain import TEXTS, key_text, one_line, value_text
-from echelon.load import ScenarioError, load, parse
+from echelon.load import ScenarioError
+from echelon.sim.parts import load, parse
 
 SCENARIOS = sorted((Path(__file__).resolve().parent.parent / "deploy" / "scenarios").glob("*.toml"))
 TEXTS_OF = {path.stem: path.read_text(encoding="utf-8") for path in SCENARIOS}
@@ -107,12 +108,16 @@ def test_the_base_is_right():
         # One of several
         (
             ("mass = 10.0", "model = 'rigid'"),
-            "robot.model = 'rigid': must be one of 'paper', 'rigid_body'; did you mean 'rigid_body'?",
+            "robot.model = 'rigid': must be one of 'paper', 'rigid_body', or 'file.py:Class'; did you mean 'rigid_body'?",
         ),
-        (("mass = 10.0", "model = [1]"), "robot.model = [1]: must be one of 'paper', 'rigid_body'"),
+        (
+            ("mass = 10.0", "model = [1]"),
+            "robot.model = [1]: must be one of 'paper', 'rigid_body', or 'file.py:Class'",
+        ),
         (
             ('kind = "circle"', 'kind = "circel"'),
-            "trajectory.kind = 'circel': must be one of 'line', 'circle', 'sine', 'waypoints'; did you mean 'circle'?",
+            "trajectory.kind = 'circel': must be one of 'line', 'circle', 'sine', 'waypoints', or 'file.py:Class'; did you "
+            "mean 'circle'?",
         ),
         (
             ('kind = "circle"', "kind = 3"),
@@ -127,9 +132,9 @@ def test_the_base_is_right():
         (("radius = 1.0", "raduis = 1.0"), "trajectory.raduis: unknown key; did you mean 'radius'?"),
         (
             ("radius = 1.0", "radius = 1.0\nspeed = 2"),
-            "trajectory.speed: unknown key; known here: centre, kind, phase, radius, rate",
+            "trajectory.speed: unknown key; known here: centre, phase, radius, rate",
         ),
-        (("radius = 1.0", "radius = 1.0\ncircle = 2"), "trajectory.circle: unknown key; known here: centre, kind,"),
+        (("radius = 1.0", "radius = 1.0\ncircle = 2"), "trajectory.circle: unknown key; known here: centre, phase"),
         (("duration", "duraton"), "duraton: unknown key; did you mean 'duration'?"),
         (("duration = 1.0", ""), "duration: missing"),
         (("mass = 10.0", "maas = 10.0"), "robot.maas: unknown key; did you mean 'mass'?"),

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_shapes import variables
 
-from echelon.load import ScenarioError, load, parse
+from echelon.load import ScenarioError
 from echelon.members import MAX_ROBOTS, nanoseconds
 from echelon.messages import Channel
 from echelon.plan import Plan, PlanError
 from echelon.planning import path_matches
+from echelon.sim.parts import load, parse
 
 SCENARIOS = Path(__file__).resolve().parent.parent / "deploy" / "scenarios"
 HEAD = """
@@ -126,7 +127,7 @@ def test_robots_inherit_level_by_level():
         "formation.groups.a.robot.arm=0.7",
     )
     assert [(robot.mass, robot.arm) for robot in plan.robots] == [(1, 0.4), (3, 0.7), (4, 0.7), (2, 0.7)]
-    assert plan.robots[0].model == "paper"
+    assert plan.robots[0].model.use == "paper"
     assert plan.robots[0].torque_limit == math.inf
 
 

@@ -14,8 +14,8 @@ from trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_ran
 
 from echelon.controller.law import BlockGains, CentralLaw
 from echelon.controller.sampled import delay_margin, error_map, largest_stable_delay, spectral_radius, tick_gains
-from echelon.load import load
 from echelon.plan import Array, Plan
+from echelon.sim.parts import load
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=30)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,9 +12,12 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 import echelon.scenario
-from echelon.load import ScenarioError, effective_toml, load, parse
+from echelon.controller.trajectory import Waypoints
+from echelon.load import ScenarioError, effective_toml
+from echelon.part_fields import PartContext
 from echelon.plan import Plan
-from echelon.scenario import RobotTable, Scenario, Shape, Waypoints
+from echelon.scenario import RobotTable, Scenario, Shape
+from echelon.sim.parts import REGISTRY, load, parse
 
 SCENARIOS = sorted((Path(__file__).resolve().parent.parent / "deploy" / "scenarios").glob("*.toml"))
 
@@ -144,14 +147,14 @@ def test_limits_may_be_infinite_and_nothing_else():
 @pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [1.0, 0.5], [0.0, 1.0, 2.0], [-1.0, 0.0]])
 def test_waypoints_need_ascending_times(times):
     with pytest.raises(ValidationError):
-        Waypoints(kind="waypoints", points=[(0, 0), (1, 1)], times=times)
+        Waypoints(points=[(0, 0), (1, 1)], times=times)
 
 
 @pytest.mark.parametrize("name", ["", "A", "1a", "a-b", "a.b", "a/b", "a b", "é", "a" * 33, "a\n", "**"])
 def test_names(name):
     scenario, _ = load(SCENARIOS[0])
     with pytest.raises(ValidationError):
-        Scenario.model_validate(scenario.model_dump() | {"name": name})
+        Scenario.model_validate(scenario.model_dump() | {"name": name}, context=PartContext(REGISTRY, Path()))
 
 
 def test_shipped_scenarios_are_what_they_say():

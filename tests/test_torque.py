@@ -13,9 +13,9 @@ from trees import plan_of, scenario
 from echelon.agents.plant import RobotState, make_step, state_at
 from echelon.agents.robot import Robot
 from echelon.agents.torque import TorqueLimits, make_inverse
-from echelon.load import load
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Array, RobotPlan
+from echelon.sim.parts import load
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 STATES = list(product((0.0, 1.1, -2.5), (-1.2, 0.0, 0.8), (-6.0, 0.0, 3.0)))

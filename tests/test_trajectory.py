@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from echelon.controller.trajectory import TRAJECTORIES, make_trajectory, sample
-from echelon.plan import TrajectoryPlan
+from echelon.controller.trajectory import TRAJECTORIES, sample
 
 KINDS = {
     "line": {"start": (1.0, -2.0), "velocity": (0.3, -0.7)},
@@ -17,7 +16,7 @@ POINTS, TIMES = np.array(KINDS["waypoints"]["points"]), KINDS["waypoints"]["time
 
 
 def made(kind: str):
-    return make_trajectory(TrajectoryPlan(kind, KINDS[kind]))
+    return TRAJECTORIES[kind].model_validate(KINDS[kind])
 
 
 def test_all_kinds_are_tested():
@@ -52,7 +51,7 @@ def test_positions_are_those_of_the_formulas():
 
 def test_paper_trajectory():
     parameters = {"start": (0.0, 0.0), "speed": 1.0, "amplitude": 30.0, "rate": 0.1}
-    paper = make_trajectory(TrajectoryPlan("sine", parameters))
+    paper = TRAJECTORIES["sine"].model_validate(parameters)
     for t in (0.0, 3.0, 11.0):
         np.testing.assert_allclose(paper.at(t)[0], (t, 30 * np.sin(0.1 * t)))
 
@@ -80,7 +79,7 @@ def test_waypoints_go_straight_and_never_back():
 
 def test_a_leg_has_least_jerk():
     """Of all polynomials of degree 9 from rest to rest, ∫ jerk² is least for ours (it is 720 for a unit leg)."""
-    trajectory = make_trajectory(TrajectoryPlan("waypoints", {"points": ((0.0, 0.0), (1.0, 0.0)), "times": (0.0, 1.0)}))
+    trajectory = TRAJECTORIES["waypoints"](points=[(0.0, 0.0), (1.0, 0.0)], times=[0.0, 1.0])
     nodes, weights = np.polynomial.legendre.leggauss(12)
     nodes, weights = (nodes + 1) / 2, weights / 2
 
@@ -99,8 +98,3 @@ def test_a_leg_has_least_jerk():
     assert best.fun == pytest.approx(720, rel=1e-8)
     times = np.linspace(0, 1, 21)
     np.testing.assert_allclose(sample(trajectory, times)[:, 0, 0], position(best.x)(times), atol=1e-6)
-
-
-def test_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="must be one of line, circle, sine, waypoints"):
-        make_trajectory(TrajectoryPlan("spiral", {}))

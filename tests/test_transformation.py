@@ -10,8 +10,8 @@ from synthetic import PAPER
 from trees import PAPER_TREE, Tree, plan_of, scenario, trees
 
 from echelon.controller.transformation import Transformation, desired_shape, node_matrix, subtree_robots
-from echelon.load import load
 from echelon.plan import Array, ShapePlan
+from echelon.sim.parts import load
 
 WEIGHTS = st.lists(st.integers(1, 30), min_size=1, max_size=12)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,11 @@ from hypothesis import strategies as st
 from numpy.random import Generator
 
 from echelon.layout import sized
+from echelon.part_fields import PartContext
 from echelon.plan import Plan
 from echelon.planning import make_plan
 from echelon.scenario import Scenario
+from echelon.sim.parts import REGISTRY
 
 Tree = Sequence[Any]
 """Children of a node: None is a robot, a sequence a group"""
@@ -75,7 +78,7 @@ def scenario(tree: Tree, random: Generator, **tables: Any) -> dict[str, Any]:
 
 def plan_of(table: dict[str, Any]) -> Plan:
     """Returns the plan of a scenario's table."""
-    return make_plan(Scenario.model_validate(table))
+    return make_plan(Scenario.model_validate(table, context=PartContext(REGISTRY, Path())), REGISTRY)
 
 
 def random_law(tree: Tree, random: Generator, time_scales: str = "three", coupling: float = 0.5) -> dict[str, Any]:

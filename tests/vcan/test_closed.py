@@ -15,8 +15,8 @@ import cantools
 import pytest
 
 from echelon.bridge.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
-from echelon.load import load
 from echelon.sim.live import Display
+from echelon.sim.parts import load
 from echelon.sim.run import execute
 from tests.vcan.test_vcan import ip, listener, next_frame, somebody_listens
 

@@ -1,0 +1,203 @@
+"""Parts of a run that others can write: laws, plants, trajectories and drive protocols.
+
+A part is a class derived from the base class of its group (Law, Plant, Trajectory, DriveProtocol).  It is a pydantic model:
+its fields are the parameters that a scenario gives, and pydantic checks them.  A scenario names a part in one of three ways:
+
+    use = "circle"                    built into this package
+    use = "spiral"                    installed: an entry point of the group `echelon.trajectories`
+    use = "my_paths.py:Spiral"        a class in a Python file beside the scenario
+
+A file is read once, when the scenario is loaded.  Its text travels with the plan to every process of a run, so all of them run
+the same code, whatever happens to the file meanwhile, and no folder is added to Python's module path.
+"""
+
+import hashlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from echelon.explain import PartError
+
+T_co = TypeVar("T_co", covariant=True)
+
+GROUPS: Final = ("laws", "plants", "trajectories", "protocols")
+"""The kinds of parts; `echelon.<group>` is the group of their entry points."""
+
+
+class Plugin(BaseModel):
+    """Base of every part: a frozen pydantic model whose fields are its parameters; unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PartRunError(Exception):
+    """A part that others wrote failed in a run; the text names its file and class, and what it did."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The Python file that a part comes from."""
+
+    name: str
+    """As the scenario names it, relative to the scenario's folder"""
+    text: str
+
+    @property
+    def sha256(self) -> str:
+        """The file's hash, hexadecimal."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Part(Generic[T_co]):
+    """A part as a plan holds it: `made` is the object itself, `use` and `parameters` are what the scenario says of it."""
+
+    use: str
+    parameters: Mapping[str, Any]
+    """All of them, defaults included, as TOML can hold them"""
+    source: Source | None
+    """None for parts that are built in or installed"""
+    made: T_co = field(compare=False)
+
+    @property
+    def is_own(self) -> bool:
+        """True for parts of this package: their answers need no check."""
+        return type(self.made).__module__.startswith("echelon.")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles the source and not the object: a process that gets a plan runs the file's text itself."""
+        if self.source is None:
+            return Part, (self.use, self.parameters, None, self.made)
+        return _from_source, (self.use, self.parameters, self.source)
+
+
+def _from_source(use: str, parameters: Mapping[str, Any], source: Source) -> Part[Any]:
+    made = _class_in(source, use.rpartition(":")[2]).model_validate(dict(parameters))
+    return Part(use, parameters, source, made)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A kind of parts: its name (one of `GROUPS`), the base class of its parts, and those that are built in, by name."""
+
+    name: str
+    base: type[Plugin]
+    built_in: Mapping[str, type[Plugin]]
+
+    def find(self, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
+        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        if use in self.built_in:
+            return self.built_in[use], None
+        file, colon, name = use.rpartition(":")
+        if colon and file.endswith(".py"):
+            source = read_source(file, folder)
+            return self._checked(_class_in(source, name), use), source
+        installed = {point.name: point for point in entry_points(group=f"echelon.{self.name}")}
+        if use not in installed:
+            raise PartError(self._unknown(use, [*self.built_in, *installed]))
+        try:
+            found = installed[use].load()
+        except Exception as error:
+            raise PartError(f"the installed {installed[use].value} cannot be loaded: {_said(error)}") from None
+        return self._checked(found, use), None
+
+    def make(self, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
+        """Returns a part with its parameters checked.  Raises PartError."""
+        found, source = self.find(use, folder)
+        try:
+            made = found.model_validate(dict(parameters))
+        except ValidationError as error:
+            errors = error.errors(include_url=False)
+            raise PartError("wrong parameters", errors=errors, model=found) from None
+        except Exception as error:  # of a validator that others wrote
+            raise PartError(f"{use} refuses its parameters: {_said(error)}") from None
+        return Part(use, made.model_dump(mode="json", exclude_none=True), source, made)
+
+    def _checked(self, found: Any, use: str) -> type[Plugin]:
+        if not (isinstance(found, type) and issubclass(found, self.base)):
+            raise PartError(f"{use} must be a class derived from {self.base.__module__}.{self.base.__name__}")
+        if missing := sorted(getattr(found, "__abstractmethods__", ())):
+            raise PartError(f"{use} lacks the method {', '.join(missing)}")
+        return found
+
+    def _unknown(self, use: str, known: list[str]) -> str:
+        close = get_close_matches(use, known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        return f"{allowed(known)}{hint}"
+
+
+@dataclass(frozen=True, slots=True)
+class Registry:
+    """All groups of parts.  Who assembles runs makes it (`echelon.sim.parts`), and planning uses it."""
+
+    groups: Mapping[str, Group]
+
+    def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
+        """Returns a part of a group with its parameters checked.  Raises PartError."""
+        return self.groups[group].make(use, parameters, folder)
+
+    def allowed(self, group: str) -> str:
+        """Returns what a scenario may write for a part of a group."""
+        return allowed(list(self.groups[group].built_in))
+
+
+def allowed(names: list[str]) -> str:
+    """Returns the sentence that says which parts there are."""
+    return f"must be one of {', '.join(map(repr, names))}, or 'file.py:Class'"
+
+
+def read_source(name: str, folder: Path) -> Source:
+    """Returns the text of a Python file.  Raises PartError."""
+    path = folder / name
+    try:
+        return Source(name, path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise PartError(f"{path}: {error.strerror}") from None
+    except ValueError as error:  # not UTF-8, or a path with a zero byte
+        raise PartError(f"{path}: is not UTF-8 text: {error}") from None
+
+
+def _class_in(source: Source, name: str) -> Any:
+    """Returns a class of a file.  Raises PartError."""
+    module = _module(source)
+    if not hasattr(module, name):
+        classes = [
+            key
+            for key, value in vars(module).items()
+            if isinstance(value, type) and value.__module__ == module.__name__
+        ]
+        there = f"; it has {', '.join(classes)}" if classes else ""
+        raise PartError(f"{source.name} has no class {name}{there}")
+    return getattr(module, name)
+
+
+def _module(source: Source) -> ModuleType:
+    """Runs a file's text once per process.  The module's name holds the text's hash: two files of one name do not meet."""
+    name = f"echelon_part_{source.sha256[:16]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    module = ModuleType(name)
+    module.__file__ = source.name
+    sys.modules[name] = module  # dataclasses and pydantic look their module up there
+    try:
+        exec(compile(source.text, source.name, "exec"), module.__dict__)
+    except SyntaxError as error:
+        del sys.modules[name]
+        raise PartError(f"{source.name}, line {error.lineno}: {error.msg}") from None
+    except BaseException as error:
+        del sys.modules[name]
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise PartError(f"{source.name}: {_said(error)}") from None
+    return module
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

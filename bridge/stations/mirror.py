@@ -1,21 +1,24 @@
-"""The bridge at work: robots' states in; frames out, on the bus, in can.log, and as copies for the recorder."""
+"""The bridge where torque is mirrored: robots' states in; frames out on the bus, in can.log, and as copies to the recorder."""
 
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from echelon.bridge.bridge import Bridge
 from echelon.bridge.bus import open_bus
 from echelon.bridge.bus_load import bus_load
 from echelon.bridge.bus_url import listen_command
+from echelon.bridge.buses import scheduled
 from echelon.bridge.canlog import CanLog
 from echelon.bridge.fit import plan_fit
 from echelon.bridge.frame_message import BRIDGE_NODE, add_words
 from echelon.bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.protocols import torque_frames
+from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped_text
+from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.torque_mirror import TorqueMirror
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
@@ -24,17 +27,13 @@ TAU_LEFT: Final = STATE_FIELDS.index("tau_left")
 SATURATED: Final = STATE_FIELDS.index("saturated")
 
 
-class Station:
-    """A bridge with its bus, its log and its DBC.  `url` says in full where the frames can be heard.
-
-    Raises ValueError or OSError if the bus or the files cannot be had.
-    """
+class MirrorBridge(Bridge):
+    """A torque mirror with its buses, its log and its DBC.  Raises ValueError or OSError if a bus or a file cannot be had."""
 
     def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
-        robots = [robot.path for robot in plan.robots]
         self._plan = plan
-        self._bridge = Bridge(
-            robots,
+        self._mirror = TorqueMirror(
+            [robot.path for robot in plan.robots],
             plan.can.torque_scale,
             [robot.period_ns for robot in plan.robots],
             [robot.envelope for robot in plan.robots],
@@ -51,14 +50,14 @@ class Station:
         self._sequence = 0
         self._time_ns = 0
 
-    def put(self, messages: list[Message]) -> list[Message]:
-        """Sends the torques of robots' states, in order of time; returns the frames as messages, one per instant.
+    def take(self, messages: Sequence[Message]) -> list[Message]:
+        """Sends the torques of robots' states; returns the frames as messages, one per instant.
 
         The state at the start says nothing of torque: the first frame of a robot ends its first period.
         """
         copies: list[Message] = []
         words: list[int] = []
-        buses, names, log, encode = self._buses, self._names, self._log, self._bridge.encode
+        buses, names, log, encode = self._buses, self._names, self._log, self._mirror.encode
         wall_ns = time.monotonic_ns()
         for channel, source, _, time_ns, values in messages:
             if channel is not Channel.STATE or time_ns == 0:
@@ -77,6 +76,9 @@ class Station:
         self._copy(words, copies)
         return copies
 
+    def stop(self) -> None:
+        """Does nothing: mirrored frames turn no wheel."""
+
     def flush(self) -> None:
         """Hands what is logged to the operating system."""
         self._log.flush()
@@ -87,51 +89,54 @@ class Station:
         for bus in self._buses:
             bus.close()
 
-    def progress(self) -> dict[str, Any]:
-        """Returns what a live table shows."""
-        stopped = self._bridge.stopped()
-        return {
-            "url": self.url,
-            "load": self._load(),
-            "frames": self._bridge.frames,
-            "stopped": ", ".join(f"{number} {reason}" for reason, number in stopped.most_common()),
-        }
-
-    def result(self) -> dict[str, Any]:
-        """Returns the counts of bridge, bus and log, and the load this would be on a real bus, for the summary."""
-        bits = self._bridge.bits / self._bridge.frames if self._bridge.frames else 0.0
-        robots = self._bridge.summary()
-        fit = plan_fit(self._plan)
-        return {
-            "url": self.url,
-            "path": "mirror",
-            "listen": "; ".join(command for bus in self._buses if (command := listen_command(bus.url))),
-            "bitrate": self._plan.can.buses[0].bitrate,
-            "torque_scale": self._plan.can.torque_scale,
-            "frames": self._bridge.frames,
-            "clipped": sum(robot["clipped"] for robot in robots["robots"].values()),
-            "load_mean": self._load(),
-            "bits_per_frame": bits,
-            "fit": fit[0].lines[0] if len(fit) == 1 else [bus.lines[0] for bus in fit],
-            "advice": [way for bus in fit for way in bus.advice],
-            "sent": sum(bus.counts.sent for bus in self._buses),
-            "failed": sum(bus.counts.failed for bus in self._buses),
-            "dropped": sum(bus.counts.dropped for bus in self._buses),
-            "log_lost": self._log.counts.lost,
-            "log_error": str(self._log.error) if self._log.error else None,
-            "robots": robots["robots"],
-            "messages": self._sequence,
-        }
-
-    def _load(self) -> float:
-        """Returns the share of a real bus that the frames so far take, in run time."""
-        if not self._time_ns:
-            return 0.0
-        return bus_load(
-            self._bridge.frames * 1e9 / self._time_ns,
-            sum(bus.bitrate for bus in self._plan.can.buses),
-            self._bridge.bits / max(self._bridge.frames, 1),
+    def progress(self) -> BridgeProgress:
+        """Returns how it stands."""
+        return BridgeProgress(
+            url=self.url,
+            load=max(self._loads()),
+            frames=self._mirror.frames,
+            stopped=stopped_text([counts.stopped for counts in self._mirror.counts]),
         )
+
+    def report(self) -> CanReport:
+        """Returns what became of frames and torques, and the load this would be on real buses."""
+        loads, fit = self._loads(), plan_fit(self._plan)
+        return CanReport(
+            path="mirror",
+            timing=None,
+            url=self.url,
+            listen="; ".join(command for bus in self._buses if (command := listen_command(bus.url))),
+            torque_scale=self._plan.can.torque_scale,
+            log_start=0.0,
+            frames=self._mirror.frames,
+            load_mean=max(loads),
+            fit=tuple(bus.lines[0] for bus in fit),
+            advice=tuple(way for bus in fit for way in bus.advice),
+            buses=tuple(
+                BusReport(bus.name, bus.bitrate, load) for bus, load in zip(self._plan.can.buses, loads, strict=True)
+            ),
+            scheduled=scheduled(self._plan),
+            sent=sum(bus.counts.sent for bus in self._buses),
+            failed=sum(bus.counts.failed for bus in self._buses),
+            dropped=sum(bus.counts.dropped for bus in self._buses),
+            log_lost=self._log.counts.lost,
+            log_error=str(self._log.error) if self._log.error else None,
+            robots={robot.name: self._mirror.report(robot.index, robot.drive.protocol) for robot in self._plan.robots},
+            messages=self._sequence,
+        )
+
+    def _loads(self) -> list[float]:
+        """Returns the share of each bus that its frames so far would take if it were real, in run time."""
+        frames, bits = [0] * len(self._names), [0] * len(self._names)
+        for bus, counts in zip(self._bus_of, self._mirror.counts, strict=True):
+            frames[bus] += counts.frames
+            bits[bus] += counts.bits.bits
+        if not self._time_ns:
+            return [0.0] * len(frames)
+        return [
+            bus_load(count * 1e9 / self._time_ns, bus.bitrate, total / max(count, 1))
+            for count, total, bus in zip(frames, bits, self._plan.can.buses, strict=True)
+        ]
 
     def _copy(self, words: list[int], copies: list[Message]) -> None:
         if words:

@@ -104,10 +104,10 @@ class RobotOnBus(Robot):
         self._limited_count = 0
         self._heard = (0.0, 0.0)
         deepest = max(node.depth for node in plan.nodes)
-        bridge = plan.stations[0].index
+        assert plan.bridge is not None
         h_ns = robot.torque_period_ns
         self.stages = (
-            Stage("move", -1, h_ns, (Input(bridge, Channel.WHEELS),), self._turn),
+            Stage("move", -1, h_ns, (Input(plan.bridge.index, Channel.WHEELS),), self._turn),
             Stage("say", 0, robot.period_ns, (), self._say),
             Stage("want", 2 * deepest + 3, h_ns, (Input(robot.parent, Channel.COMMAND),), self._want),
         )

@@ -111,7 +111,8 @@ class Commander:
     Its models of the buses have the drives' controllers in them too, unless `alone`."""
 
     def __init__(self, plan: Plan, *, alone: bool = False) -> None:
-        bridge = plan.stations[0]
+        bridge = plan.bridge
+        assert bridge is not None
         self.index = bridge.index
         self._first_ns = bridge.first_ns
         self._period_ns = bridge.period_ns
@@ -139,10 +140,10 @@ class Commander:
         self.refused: Counter[str] = Counter()
         """What came as messages and cannot be"""
         deepest = max(node.depth for node in plan.nodes)
-        heard = tuple(Input(station.index, Channel.FRAMES) for station in plan.stations[1:])
+        reports = () if plan.drives is None else (Input(plan.drives.index, Channel.FRAMES),)
         torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
         self.stages = (
-            Stage("hear", -2, self._period_ns, heard, self._hear, self._first_ns),
+            Stage("hear", -2, self._period_ns, reports, self._hear, self._first_ns),
             Stage("send", 2 * deepest + 4, self._period_ns, torques, self._send, self._first_ns),
         )
 

@@ -55,7 +55,9 @@ class DriveBank:
     """All virtual drives of a plan, on all its buses."""
 
     def __init__(self, plan: Plan) -> None:
-        bridge, drives = plan.stations
+        bridge, drives = plan.bridge, plan.drives
+        assert bridge is not None
+        assert drives is not None
         self.index = drives.index
         self._first_ns = drives.first_ns
         self._plan = plan

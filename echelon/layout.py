@@ -8,7 +8,7 @@ from echelon.plan import NodePlan, Plan
 
 def message_size(plan: Plan, source: int, channel: Channel) -> int | None:
     """Returns the number of values, None if it varies (frames).  Raises ValueError if the source has no such channel."""
-    one = plan.everyone[source]
+    one = plan.all_roles[source]
     match channel:
         case Channel.STATE if one.role == "robot":
             return len(STATE_FIELDS)
@@ -42,12 +42,12 @@ def said_by(plan: Plan) -> dict[tuple[int, Channel], int | None]:
 
     Where torque is mirrored, the bridge is no member: it says frames under the number after the last."""
     found: dict[tuple[int, Channel], int | None] = {}
-    for one in plan.everyone:
+    for one in plan.all_roles:
         for channel in Channel:
             try:
                 found[one.index, channel] = message_size(plan, one.index, channel)
             except ValueError:
                 pass
-    if not plan.stations:
-        found[len(plan.members), Channel.FRAMES] = None
+    if not plan.can.closed:
+        found[len(plan.formation), Channel.FRAMES] = None
     return found

@@ -50,7 +50,7 @@ class Mailbox:
     """All inputs of one role; with `paced`, it misses something too while it is `LEAD` ahead of a source."""
 
     def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
-        members = plan.everyone
+        members = plan.all_roles
         receiver = members[role.index].name
         tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._slots = {

@@ -90,7 +90,7 @@ class Runner:
     """One role of a plan, connected.  Declares everything it sends and receives when it is made."""
 
     def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool, virtual: bool) -> None:
-        members = plan.everyone
+        members = plan.all_roles
         member = members[role.index]
         self.role, self.plan = role, plan
         self.mailbox = Mailbox(role, plan, paced=virtual)
@@ -213,7 +213,7 @@ class Runner:
         soon as nothing it wants is missing, in the handler of what came last; at its deadline it runs with what there is.
         """
         # Stations between robots and wheels take turns before and after the members.
-        early, late = (3, 5) if self.plan.stations else (0, 3)
+        early, late = (3, 5) if self.plan.can.closed else (0, 3)
         levels = early + max(node.depth for node in self.plan.nodes) * 2 + late
         self._allowed_ns = [stage.period_ns * (early + stage.level) // levels for stage in self.role.stages]
         self._start_ns = start_ns

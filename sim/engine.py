@@ -13,27 +13,30 @@ from echelon.controller.node import TreeNode
 from echelon.link import LinkCounts
 from echelon.mailbox import Mailbox
 from echelon.messages import Message
-from echelon.plan import Plan
+from echelon.plan import NodePlan, Plan, RobotPlan
 from echelon.role import Role
 
 Sink = Callable[[Message], None]
 
 
 def make_roles(plan: Plan) -> list[Role]:
-    """Returns the roles of a plan by index: robots, then nodes."""
-    return [make_role(plan, index) for index in range(len(plan.everyone))]
+    """Returns the roles of a plan by index."""
+    return [make_role(plan, index) for index in range(len(plan.all_roles))]
 
 
 def make_role(plan: Plan, index: int) -> Role:
-    """Returns the role of a robot, a node, or a station between robots and their wheels."""
-    if index < len(plan.robots):
+    """Returns one role of a plan: a robot, a node, or the bridge or the drives between robots and their wheels.
+
+    Raises IndexError if the plan has no role of that index."""
+    one = plan.all_roles[index]
+    if isinstance(one, RobotPlan):
         return make_robot(plan, index)
-    if index < len(plan.members):
+    if isinstance(one, NodePlan):
         return TreeNode(plan, index)
     from echelon.bridge.commander import Commander  # the protocols of drives, for two processes alone
     from echelon.bridge.drive_bank import DriveBank
 
-    return Commander(plan) if index == plan.stations[0].index else DriveBank(plan)
+    return Commander(plan) if one.role == "bridge" else DriveBank(plan)
 
 
 class Engine:

@@ -183,7 +183,7 @@ def _whole(value: float) -> int | None:
 
 def link_row(plan: Plan, counts: LinkCounts) -> Row:
     """Returns one link's counts with its members' names, ages in seconds: a row of `links.csv`."""
-    members = plan.everyone
+    members = plan.all_roles
     return {
         "source": members[counts.source].name,
         "receiver": members[counts.receiver].name,

@@ -76,7 +76,7 @@ def _open(spec: ProcessSpec) -> Session:
 
 def _station_body(spec: ProcessSpec) -> Body:
     """Returns what a process between robots and wheels does; each way needs modules of its own."""
-    if not spec.plan.stations:
+    if not spec.plan.can.closed:
         from echelon.sim.watchers import run_bridge
 
         return run_bridge

@@ -65,7 +65,7 @@ class Recorder:
         source, channel = message.source, message.channel
         number, size, encode = self._routes[16 * source + channel]
         if len(raw) != size:
-            name = self._plan.everyone[source].name
+            name = self._plan.all_roles[source].name
             raise ValueError(f"{channel.name} of {name} has {len(raw) // 8} values; it must have {size // 8}")
         self._file.add(number, message.sequence, self._now, encode(self._head, raw))
         if channel is Channel.STATE:
@@ -81,7 +81,7 @@ class Recorder:
 
     def record_links(self, time_ns: int, links: list[LinkCounts]) -> None:
         """Takes the counts of links at an instant."""
-        members = self._plan.everyone
+        members = self._plan.all_roles
         for counts in links if self._file.failure is None else ():
             name = f"{members[counts.source].name} to {members[counts.receiver].name}"
             data = ros.link_statistics(time_ns, counts, name)
@@ -124,11 +124,10 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
         topics[topic] = f"echelon_msgs/{kind}"
         routes[16 * source + channel] = (topic, splice)
 
-    if plan.stations:
+    if plan.bridge is not None:
         for robot in plan.robots:
             add(Channel.TORQUE, robot.index, f"/{robot.path}/torque", "WheelTorque", ros.wheel_torque())
-        bridge = plan.stations[0]
-        add(Channel.WHEELS, bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
+        add(Channel.WHEELS, plan.bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
     coupled, avoiding = plan.coupled, plan.avoidance.enabled
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())

@@ -129,18 +129,19 @@ def _in_process(
     gathered: list[Any] = []
     engine = Engine(plan, gathered.append)
     station: Any = None
-    if plan.stations:
+    if plan.can.closed:
+        assert plan.bridge is not None
         from echelon.bridge.closed import ClosedStation
         from echelon.bridge.commander import Commander
 
-        commander = engine.roles[plan.stations[0].index]
+        commander = engine.roles[plan.bridge.index]
         assert isinstance(commander, Commander)
         station = ClosedStation(plan, can_urls, folder, paired=False, role=commander)
     elif can_urls:
         from echelon.bridge.station import Station
 
         station = Station(plan, can_urls, folder)
-    order = TimeOrder(range(len(plan.everyone) if plan.stations else len(plan.members) + bool(can_urls)))
+    order = TimeOrder(range(len(plan.all_roles) if plan.can.closed else len(plan.formation) + bool(can_urls)))
     progress = Progress(phase="running", started_s=time.monotonic())
     if station is not None:
         progress.can["url"] = station.url
@@ -148,7 +149,7 @@ def _in_process(
     failure: str | None = None
 
     def pass_on() -> None:
-        if plan.stations:
+        if plan.can.closed:
             for message in gathered:
                 if message.channel is Channel.FRAMES and message.source == station.index:
                     station.show(frames_of(message))
@@ -176,7 +177,7 @@ def _in_process(
                 break
     except KeyboardInterrupt:
         failure = "interrupted"
-        if plan.stations:
+        if plan.can.closed:
             station.rail.stopping.set()  # a bus that takes no frames is not waited for any more
     wall_s = time.monotonic() - begun_s
     try:
@@ -186,7 +187,7 @@ def _in_process(
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
-    if plan.stations:
+    if plan.can.closed:
         station.stop_wheels(station.role.next_ns)
     if station is not None:
         station.close()
@@ -208,11 +209,11 @@ def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
     if station is None:
         return {}
     result: dict[str, Any] = station.result()
-    if engine.plan.stations[1:]:
+    if engine.plan.drives is not None:
         from echelon.bridge.buses import merge_rows
         from echelon.bridge.drive_bank import DriveBank
 
-        drives = engine.roles[engine.plan.stations[1].index]
+        drives = engine.roles[engine.plan.drives.index]
         assert isinstance(drives, DriveBank)
         result["drives"] = drives.result()
         merge_rows(result["buses"], drives.lost_rows())

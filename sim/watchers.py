@@ -85,8 +85,8 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
     plan = spec.plan
     # The bridge's messages come after the members'; drives say something of their own only where time is virtual.
-    stations = len(plan.stations) if spec.virtual else 1
-    sources = range(len(plan.members) + (stations if plan.stations else bool(spec.can_urls)))
+    on_bus = len(plan.bus_roles) if spec.virtual else 1
+    sources = range(len(plan.formation) + (on_bus if plan.can.closed else bool(spec.can_urls)))
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
     try:
         recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
@@ -121,7 +121,7 @@ class Recording:
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self._time_ns = 0
-        self._bridge = len(plan.members)
+        self._bridge = len(plan.formation)
 
     def add(self, messages: list[Message]) -> None:
         """Takes messages in order of time."""

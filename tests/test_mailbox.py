@@ -23,7 +23,7 @@ def mailbox_of(links: Sequence[LinkPlan], seed: int = 1, stages: Sequence[Stage]
     inputs = tuple(Input(link.source, link.channel) for link in links)
     stages = stages or [Stage("all", 0, PERIOD, inputs, lambda time_ns, heard: ())]
     plan: Any = SimpleNamespace(
-        everyone=[SimpleNamespace(name=f"m{index}") for index in range(RECEIVER + 1)],
+        all_roles=[SimpleNamespace(name=f"m{index}") for index in range(RECEIVER + 1)],
         seed=seed,
         links_into=lambda receiver: tuple(links) if receiver == RECEIVER else (),
     )

@@ -43,7 +43,7 @@ def batches_by_source(messages: list[Message]) -> list[bytes]:
 
 def reception(inbox: Any) -> Reception:
     """Returns the reception of the paper's members."""
-    return Reception(inbox, range(len(paper().members)), paper())
+    return Reception(inbox, range(len(paper().formation)), paper())
 
 
 def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
@@ -54,7 +54,7 @@ def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
 def test_batches_come_out_in_order() -> None:
     messages = list(invented(paper(), TICKS))
     received = reception(Inbox(*[[each] for each in reversed(batches_by_source(messages))]))
-    out = [each for _ in range(len(paper().members)) for each in received.take(1.0)]
+    out = [each for _ in range(len(paper().formation)) for each in received.take(1.0)]
     out += [each for portion in received.drain(len(messages)) for each in portion]
     assert keys(out) == sorted(keys(messages))
     assert received.refused_count == 0
@@ -100,7 +100,7 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
     messages = list(invented(paper(), TICKS))
     end_ns = messages[-1].time_ns
     timed = TimedFrame(end_ns, 0, 0, Frame(0x101, bytes(range(8))))
-    frames = Message(Channel.FRAMES, len(paper().members), 0, end_ns, pack([timed]))
+    frames = Message(Channel.FRAMES, len(paper().formation), 0, end_ns, pack([timed]))
     recording.add(messages)
     recording.add([])
     recording.add([frames])

@@ -15,6 +15,7 @@ from echelon.agents.torque import TorqueLimits, make_inverse
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 
 class Robot:
@@ -37,10 +38,9 @@ class Robot:
         self._at = 2 * robot.child_number
         self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
         self._did = (0.0,) * 9
-        deepest = max(node.depth for node in plan.nodes)
         self.stages: tuple[Stage, ...] = (
-            Stage("say", 0, robot.period_ns, (), self._say),
-            Stage("move", 2 * deepest + 3, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
+            Stage(Turn.SAY, robot.period_ns, (), self._say),
+            Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
         )
 
     def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
@@ -103,16 +103,15 @@ class RobotOnBus(Robot):
         self._torques: list[tuple[float, float]] = []
         self._limited_count = 0
         self._heard = (0.0, 0.0)
-        deepest = max(node.depth for node in plan.nodes)
         assert plan.bridge is not None
         h_ns = robot.torque_period_ns
         self.stages = (
-            Stage("move", -1, h_ns, (Input(plan.bridge.index, Channel.WHEELS),), self._turn),
-            Stage("say", 0, robot.period_ns, (), self._say),
-            Stage("want", 2 * deepest + 3, h_ns, (Input(robot.parent, Channel.COMMAND),), self._want),
+            Stage(Turn.CATCH_UP, h_ns, (Input(plan.bridge.index, Channel.WHEELS),), self._catch_up),
+            Stage(Turn.SAY, robot.period_ns, (), self._say),
+            Stage(Turn.ACT, h_ns, (Input(robot.parent, Channel.COMMAND),), self._want),
         )
 
-    def _turn(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+    def _catch_up(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Moves through the torque period that ends at `time_ns`."""
         if time_ns == 0:
             return ()

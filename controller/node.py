@@ -25,6 +25,7 @@ from echelon.controller.transformation import desired_shape, node_matrix
 from echelon.messages import NULL, Channel, Heard, Message, Values
 from echelon.plan import Array, NodePlan, Plan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +130,12 @@ class TreeNode:
             self._parent_period_ns = parent.period_ns
         self._all_rates = slice(self._all_rates_at, self._all_rates_at + (2 * len(plan.robots) if plan.coupled else 0))
 
-        deepest = max(other.depth for other in plan.nodes)
         kinds = [Channel.GROUP_STATE if is_node else Channel.STATE for is_node in self._child_is_node]
         children = tuple(Input(child, kind) for child, kind in zip(node.children, kinds, strict=True))
         parents = () if parent is None else (Input(parent.index, Channel.REFERENCE),)
         self.stages = (
-            Stage("gather", 1 + deepest - node.depth, node.period_ns, children, self._gather),
-            Stage("steer", 2 + deepest + node.depth, node.period_ns, parents, self._steer),
+            Stage(Turn.GATHER, node.period_ns, children, self._gather, depth=node.depth),
+            Stage(Turn.STEER, node.period_ns, parents, self._steer, depth=node.depth),
         )
 
     def _gather(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:

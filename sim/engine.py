@@ -1,7 +1,7 @@
 """The in-process engine: all roles of a plan in one process, messages handed over directly.  The truth of the others.
 
-Stages of one instant run in the order of their levels: robots say their states, nodes gather upwards, steer downwards,
-robots move.  What the roles hear goes through the same mailboxes, and so through the same links, as between processes.
+Stages of one instant run in the order of their turns (`echelon.turns`).  What the roles hear goes through the same
+mailboxes, and so through the same links, as between processes.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,6 +15,7 @@ from echelon.mailbox import Mailbox
 from echelon.messages import Message
 from echelon.plan import NodePlan, Plan, RobotPlan
 from echelon.role import Role
+from echelon.turns import level
 
 Sink = Callable[[Message], None]
 
@@ -53,7 +54,15 @@ class Engine:
             receivers.setdefault((link.source, link.channel), []).append(self.mailboxes[link.receiver])
         self._receivers = receivers
         stages = [
-            (stage.level, stage.period_ns, stage.first_ns, role.index, number, stage.run, self.mailboxes[role.index])
+            (
+                level(plan, stage.turn, stage.depth),
+                stage.period_ns,
+                stage.first_ns,
+                role.index,
+                number,
+                stage.run,
+                self.mailboxes[role.index],
+            )
             for role in self.roles
             for number, stage in enumerate(role.stages)
         ]

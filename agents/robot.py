@@ -12,6 +12,7 @@ import numpy as np
 
 from echelon.agents.plant import LOST, make_step, state_at
 from echelon.agents.torque import TorqueLimits, make_inverse
+from echelon.layout import acceleration_of
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Stage
@@ -35,7 +36,7 @@ class Robot:
         )
         self._inner = robot.period_ns // robot.torque_period_ns
         self._h = robot.torque_period_ns * 1e-9
-        self._at = 2 * robot.child_number
+        self._mine = acceleration_of(robot)
         self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
         self._did = (0.0,) * 9
         self.stages: tuple[Stage, ...] = (
@@ -56,7 +57,7 @@ class Robot:
         if command is None:
             ax = ay = 0.0
         else:
-            ax, ay = command.values[self._at : self._at + 2].tolist()
+            ax, ay = command.values[self._mine].tolist()
         try:
             self._advance(ax, ay, command is not None)
         except (ValueError, OverflowError):  # the run diverged: angles and speeds beyond what floats can hold
@@ -153,7 +154,7 @@ class RobotOnBus(Robot):
             self._heard = (0.0, 0.0)
             self._limits.tau_right = self._limits.tau_left = 0.0
         else:
-            ax, ay = self._heard = command.values[self._at : self._at + 2].tolist()
+            ax, ay = self._heard = command.values[self._mine].tolist()
             try:
                 right, left = self._inverse(state, ax, ay, 0.5 * self._h)
             except (ValueError, OverflowError):

@@ -64,7 +64,11 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
     messages = list(invented(paper(), TICKS))
     good = batches_by_source(messages)
     size = messages[0].values.size
-    stranger = batch([Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))])
+    strangers = [Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))]
+    leader, root = paper().nodes[0], paper().root  # one has no nodes below it, the other no parent and no robots
+    for node, channel in ((leader, Channel.REFERENCE), (root, Channel.GROUP_STATE), (root, Channel.COMMAND)):
+        strangers.append(Message(channel, node.index, 0, 0, np.zeros(6)))
+    stranger = batch(strangers)
     odd = batch([Message(Channel.STATE, 1, 0, 0, np.zeros(2)), Message(Channel.STATE, 1, 0, 2**62, np.zeros(size))])
     received = reception(Inbox([b"\x01", join([b"\x01\x00"]), good[0][:-1], stranger, odd, *good[1:]]))
     out = [each for portion in received.drain(None) for each in portion]
@@ -74,11 +78,11 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
         "batch cut in a length": 1,
         "too short": 1,
         "batch cut in a message": 1,
-        "of nobody here": 2,
+        "of nobody here": 5,
         "wrong number of values": 1,
         "of another time": 1,
     }
-    assert received.refused_count == 7
+    assert received.refused_count == 10
 
 
 def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:

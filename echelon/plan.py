@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.can_plan import DISTURBANCES, NEVER_NS, CanPlan, DrivePlan, EnvelopePlan, EventPlan, StationPlan
+from echelon.errors import UserError
 from echelon.messages import Channel
 
 Array = NDArray[np.float64]
 COORDINATOR = "coordinator"
 
 
-class PlanError(Exception):
-    """A scenario whose values do not fit together; the text begins with the key."""
+class PlanError(UserError):
+    """A scenario whose values do not fit together; each line begins with the key."""
 
 
 @dataclass(frozen=True, slots=True)

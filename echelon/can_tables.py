@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from echelon.values import (
     Bitrate,
@@ -18,6 +18,7 @@ from echelon.values import (
     Seconds,
     SecondsOrZero,
     Table,
+    alike,
 )
 
 
@@ -118,6 +119,12 @@ class Can(Table):
     """Frames that may wait to be sent, in the bridge and in each drive, before further ones are lost"""
     restart: SecondsOrZero = 0.1
     """How long a controller that went bus-off waits before it tries to come back [s]"""
+
+    @model_validator(mode="after")
+    def _names(self) -> "Can":
+        if (name := alike(self.buses)) is not None:
+            raise ValueError(f"buses: {name!r} must differ from other names by more than hyphens and underscores")
+        return self
 
 
 class DriveFault(Table):

@@ -34,7 +34,7 @@ TEXTS: Final = {
 }
 """What is said of pydantic's types of errors; those that need more than their context are in `_text`."""
 
-NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits or underscores"
+NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits, hyphens or underscores"
 PAIR_RULE: Final = "must be two numbers, [x, y]"
 
 

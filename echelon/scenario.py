@@ -23,6 +23,7 @@ from echelon.values import (
     Positive,
     Seconds,
     Table,
+    alike,
 )
 from echelon.values import number_or_table as _number_or_table
 
@@ -118,6 +119,8 @@ class Group(Table):
             raise ValueError("a group needs robots or groups")
         if twice := sorted(self.robots.keys() & self.groups.keys()):
             raise ValueError(f"{twice[0]!r} names a robot and a group")
+        if (name := alike([*self.robots, *self.groups])) is not None:
+            raise ValueError(f"{name!r} must differ from other names by more than hyphens and underscores")
         if reserved := sorted((self.robots.keys() | self.groups.keys()) & set(RESERVED_NAMES)):
             raise ValueError(f"{reserved[0]!r} is the name of a process that every run has")
         if taken := sorted(self.groups.keys() & set(BLOCK_NAMES)):

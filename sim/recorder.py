@@ -126,14 +126,14 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
 
     if plan.stations:
         for robot in plan.robots:
-            add(Channel.TORQUE, robot.index, f"/{robot.path}/torque", "WheelTorque", ros.wheel_torque())
+            add(Channel.TORQUE, robot.index, f"/{ros.ros_name(robot.path)}/torque", "WheelTorque", ros.wheel_torque())
         bridge = plan.stations[0]
         add(Channel.WHEELS, bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
     coupled, avoiding = plan.coupled, plan.avoidance.enabled
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
     for node in plan.nodes:
-        prefix = f"/{node.path}/".replace("//", "/")
+        prefix = f"/{ros.ros_name(node.path)}/".replace("//", "/")
         forces = 2 * node.robots if avoiding else 0
         if node.parent is not None:
             encoder = ros.group_state(2 * (node.robots - 1) if coupled else 0, forces)
@@ -151,9 +151,9 @@ def frame_topics(plan: Plan) -> list[str]:
     """Returns the topics of the frames, bus by bus."""
     if len(plan.can.buses) == 1:
         return [FRAMES]
-    return [f"/can/{bus.name}/frames" for bus in plan.can.buses]
+    return [f"/can/{ros.ros_name(bus.name)}/frames" for bus in plan.can.buses]
 
 
 def state_topic(path: str) -> str:
     """Returns the topic of a robot's state."""
-    return f"/{path}/state"
+    return f"/{ros.ros_name(path)}/state"

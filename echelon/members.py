@@ -9,6 +9,7 @@ from typing import Any, Final, TypeVar
 from echelon import shapes
 from echelon.can_plan import CanPlan
 from echelon.drives import DriveMaker, make_can
+from echelon.errors import Mistakes
 from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.plugins import Part, Registry
 from echelon.scenario import Group, RobotTable, Scenario, Shape
@@ -53,6 +54,7 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
         default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
+    walk.check()
     return tuple(walk.robots), tuple(walk.nodes), can
 
 
@@ -82,7 +84,9 @@ class _Place:
 
 
 class _Walk:
-    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them."""
+    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them.
+
+    Mistakes are noted on the way; what was made is worth nothing until `check` has said that there are none."""
 
     def __init__(
         self,
@@ -95,55 +99,78 @@ class _Walk:
     ) -> None:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
         self._drives, self._closed, self._default_plant = drives, closed, default_plant
+        self._mistakes = Mistakes()
+        self._of_robots: dict[str, list[str]] = {}  # what is wrong, behind the robot's key: the keys of those robots
         self.robots: list[RobotPlan] = []
         self.nodes: list[NodePlan] = []
+
+    def check(self) -> None:
+        """Raises PlanError if there were mistakes.  What many robots inherit is told of the first one."""
+        for text, keys in self._of_robots.items():
+            same = f"; the same holds for {len(keys) - 1} more" if len(keys) > 1 else ""
+            self._mistakes.lines.append(f"{keys[0]}{text}{same}")
+        self._mistakes.check(PlanError)
 
     def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
         """Adds a group and all below it; returns its node."""
         index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
         first_robot = len(self.robots)
         inherited = _overlaid(inherited, group.robot)
-        period_ns, period_key = self._acceleration_ns, "periods.acceleration"
-        if group.period is not None:
-            period_key = f"{place.key}.period"
-            period_ns = nanoseconds(group.period, period_key)
-        if period_ns % self._torque_ns:
-            raise PlanError(f"periods.torque = {self._torque_ns / 1e9}: must divide {period_key} = {period_ns / 1e9}")
+        period_key = "periods.acceleration" if group.period is None else f"{place.key}.period"
+        period_ns = self._acceleration_ns if group.period is None else 0
+        with self._mistakes.noted():
+            if group.period is not None:
+                period_ns = nanoseconds(group.period, period_key)
+            if period_ns % self._torque_ns:
+                raise PlanError(
+                    f"periods.torque = {self._torque_ns / 1e9}: must divide {period_key} = {period_ns / 1e9}"
+                )
         below = _Place(place.key, f"{place.path}/" if place.path else "", index, 0, place.depth + 1)
-        children: list[RobotPlan | NodePlan] = []
+        children: list[int] = []
+        weights: list[int] = []
         for name, table in group.robots.items():
             at = replace(below, key=f"{place.key}.robots.{name}", path=below.path + name, child_number=len(children))
-            self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
-            children.append(self.robots[-1])
+            children.append(len(self.robots))
+            weights.append(1)
+            try:
+                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
+            except PlanError as error:
+                for line in error.lines:
+                    self._of_robots.setdefault(line.removeprefix(at.key), []).append(at.key)
         for name, sub in group.groups.items():
             at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
             child = self.add_group(sub, at, inherited)
-            if period_ns % child.period_ns:
-                raise PlanError(
-                    f"{period_key} = {period_ns / 1e9}: must be a multiple of {child.period_ns / 1e9}, "
-                    f"the period of {child.name}"
-                )
-            children.append(child)
+            children.append(child.index)
+            weights.append(child.robots)
+            with self._mistakes.noted():
+                if child.period_ns and period_ns % child.period_ns:
+                    raise PlanError(
+                        f"{period_key} = {period_ns / 1e9}: must be a multiple of {child.period_ns / 1e9}, "
+                        f"the period of {child.name}"
+                    )
+        shape = ShapePlan("points", ())
+        with self._mistakes.noted():
+            shape = _shape(group.shape, len(children), f"{place.key}.shape")
         node = NodePlan(
             index=index,
             path=place.path,
             parent=place.parent,
             child_number=place.child_number,
-            children=tuple(child.index for child in children),
-            weights=tuple(child.robots if isinstance(child, NodePlan) else 1 for child in children),
+            children=tuple(children),
+            weights=tuple(weights),
             first_robot=first_robot,
             depth=place.depth,
             period_ns=period_ns,
-            shape=_shape(group.shape, len(children), f"{place.key}.shape"),
+            shape=shape,
         )
         self.nodes.append(node)
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
         values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model"})
-        for needed in NEEDED:
-            if needed not in values:
-                raise PlanError(f"{place.key}.{needed}: missing (neither here, nor in its group, nor in [robot])")
+        if lacking := [needed for needed in NEEDED if needed not in values]:
+            nowhere = "missing (neither here, nor in its group, nor in [robot])"
+            raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
         if values["offset"] == 0:
             raise PlanError(f"{place.key}.offset = 0: must not be zero, or the wheels cannot steer the reference point")
         least = values["mass"] * values["offset"] * values["offset"]

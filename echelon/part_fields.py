@@ -19,12 +19,10 @@ from echelon.plugins import Part, Registry
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
-_SCHEMA: Final[dict[str, Any]] = {
-    "type": "object",
-    "properties": {"use": {"type": "string"}, _PARAMETERS: {"type": "object"}},
-    "required": ["use"],
-    "additionalProperties": False,
-}
+PART: Final = "part"
+"""Stands in the JSON schema of a field of this kind, with the group of its parts: echelon.schema says what may be written"""
+BESIDE: Final = "beside"
+"""Stands there too; True: parameters are written beside the part's name"""
 
 
 class PartContext(NamedTuple):
@@ -116,11 +114,14 @@ def _written_by_name(part: Part[Any] | None) -> Any:
 
 
 TrajectoryField = Annotated[
-    Part[Any], PlainValidator(_inline("trajectories")), PlainSerializer(_written_inline), WithJsonSchema(_SCHEMA)
+    Part[Any],
+    PlainValidator(_inline("trajectories")),
+    PlainSerializer(_written_inline),
+    WithJsonSchema({PART: "trajectories", BESIDE: True}),
 ]
 PlantField = Annotated[
     Part[Any] | None,
     PlainValidator(_by_name("plants")),
     PlainSerializer(_written_by_name),
-    WithJsonSchema({"anyOf": [{"type": "string"}, _SCHEMA]}),
+    WithJsonSchema({PART: "plants", BESIDE: False}),
 ]

@@ -19,19 +19,19 @@ LINK_FIELDS: Final = (
 )  # fmt: skip
 
 
-def export_csv(trace: Trace, links: Sequence[LinkCounts], folder: Path) -> None:
-    """Writes `robots.csv`, `blocks.csv` and `links.csv` into a folder, which is made if need be.
+def export_csv(trace: Trace, links: Sequence[LinkCounts], folder: Path) -> list[Path]:
+    """Writes `robots.csv`, `blocks.csv` and `links.csv` into a folder, which is made if need be; returns them.
 
     Robots: every state of every robot, by time, then robot.  Blocks: at the instants at which every robot has a state,
     by time, block and component.  Links: one row each, ages in seconds.  Raises OSError.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / "robots.csv", ("t", "robot", *ROBOT_FIELDS), _robots(trace))
-    _write(folder / "blocks.csv", ("t", "block", "component", "value", "desired", "error", "rate"), _blocks(trace))
+    files = [folder / name for name in ("robots.csv", "blocks.csv", "links.csv")]
+    _write(files[0], ("t", "robot", *ROBOT_FIELDS), _robots(trace))
+    _write(files[1], ("t", "block", "component", "value", "desired", "error", "rate"), _blocks(trace))
     rows = (link_result(trace.plan, counts) for counts in links)
-    _write(
-        folder / "links.csv", LINK_FIELDS, (",".join(str(getattr(row, field)) for field in LINK_FIELDS) for row in rows)
-    )
+    _write(files[2], LINK_FIELDS, (",".join(str(getattr(row, field)) for field in LINK_FIELDS) for row in rows))
+    return files
 
 
 def _robots(trace: Trace) -> Iterable[str]:

@@ -8,34 +8,38 @@ import cantools
 
 from echelon.bridge.canlog import Logged, read_log
 from echelon.bridge.plan_dbc import plan_dbc
-from echelon.load import ScenarioError
+from echelon.errors import UserError
 from echelon.plan import Plan
-from echelon.sim.parts import parse
+from echelon.sim.parts import load
 from echelon.sim.recording import read_trace
 from echelon.sim.report import RunForReport, write_report
 from echelon.sim.results.rendering import read_summary
-from echelon.sim.usage import UsageError
 
 FRAMES: Final = 18
 """So many frames a report shows, from run time 0 on."""
 
 
 def read_run(folder: Path) -> RunForReport:
-    """Reads a run's folder.  Raises UsageError."""
+    """Reads a run's folder.  Raises UserError."""
     try:
+        _, plan = load(folder / "scenario.toml")
         toml = (folder / "scenario.toml").read_text(encoding="utf-8")
         summary = read_summary(folder / "summary.json")
-        _, plan = parse(toml, str(folder / "scenario.toml"), (), folder)
+    except OSError as error:
+        raise UserError(f"{error.filename}: {error.strerror}") from None
+    except ValueError as error:
+        raise UserError(f"{folder / 'summary.json'}: {error}") from None
+    try:
         trace = read_trace(folder / "run.mcap", plan)
     except OSError as error:
-        raise UsageError(f"{error.filename}: {error.strerror}") from None
-    except (ScenarioError, ValueError) as error:
-        raise UsageError(f"{folder}: {error}") from None
-    return RunForReport(folder.name, trace, summary, toml, first_frames(folder / "can.log", plan))
+        raise UserError(f"{error.filename}: {error.strerror}") from None
+    except ValueError as error:  # which begins with the file
+        raise UserError(str(error)) from None
+    return RunForReport(folder.resolve().name, trace, summary, toml, first_frames(folder / "can.log", plan))
 
 
 def report_on(folders: list[Path], path: Path) -> None:
-    """Writes a report of runs.  Raises UsageError and OSError."""
+    """Writes a report of runs.  Raises UserError and OSError."""
     write_report([read_run(folder) for folder in folders], path)
 
 

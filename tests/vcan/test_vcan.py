@@ -213,7 +213,7 @@ def test_multicast_beside_it() -> None:
 def test_a_whole_run_as_processes_is_on_the_bus(tmp_path: Path) -> None:
     """Thirteen members, recorder and bridge; candump beside them hears every torque, and cantools reads it in N m."""
     folder = tmp_path / "run"
-    run_command = [sys.executable, "-m", "echelon.cli", "run", "lab", "--set", "duration=1", "--set", "claims=[]"]
+    run_command = [sys.executable, "-m", "echelon", "run", "lab", "--set", "duration=1", "--set", "claims=[]"]
     run_command += ["--can", "socketcan:vcan0", "--no-report", "--quiet", "--out", str(folder)]
     listen = ["candump", "-L", "vcan0", "-n", "900", "-T", "60000"]
     with subprocess.Popen(listen, stdout=subprocess.PIPE, text=True) as candump:

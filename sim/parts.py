@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import echelon.load
+import echelon.loading
 from echelon.agents.plant import PLANTS, Plant
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
 from echelon.plan import Plan
@@ -22,10 +22,10 @@ REGISTRY: Final = Registry(
 
 def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
     """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError."""
-    return echelon.load.load(path, overrides, REGISTRY)
+    return echelon.loading.load(path, overrides, REGISTRY)
 
 
 def parse(text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path()) -> tuple[Scenario, Plan]:
     """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, `folder` holds files that the text
     names.  Raises ScenarioError."""
-    return echelon.load.parse(text, name, overrides, REGISTRY, folder)
+    return echelon.loading.parse(text, name, overrides, REGISTRY, folder)

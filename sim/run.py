@@ -9,7 +9,7 @@ import resource
 import shlex
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from hashlib import blake2b
 from importlib.metadata import version
@@ -20,7 +20,7 @@ from echelon import __version__
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.scenario import Scenario
@@ -38,20 +38,6 @@ PARTS: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
 FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finished:
-    """A finished run: its folder, its summary, and its trace."""
-
-    folder: Path
-    summary: Summary
-    trace: Trace
-
-    @property
-    def failure(self) -> str | None:
-        """Why it broke off, if it did."""
-        return self.summary.run.failure
 
 
 def new_folder(scenario: Scenario, out: Path | None) -> Path:
@@ -81,9 +67,10 @@ def execute(
     can_urls: tuple[str, ...],
     display: Display,
     stall_timeout_s: float = 30.0,
-) -> Finished:
-    """Runs a plan and writes the run's folder, except for the report.  Raises OSError if a file cannot be written, and
-    ValueError too if, in one process, the bus cannot be had."""
+) -> tuple[Summary, Trace]:
+    """Runs a plan and writes the run's folder, except for the report; returns its summary and its trace.
+
+    Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
     begun = datetime.now(UTC)
     toml = effective_toml(scenario)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
@@ -114,7 +101,7 @@ def execute(
     display.close()
     summary = summarise(outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun))
     write_summary(summary, folder / "summary.json")
-    return Finished(folder, summary, outcome.trace)
+    return summary, outcome.trace
 
 
 def judged(log: Path, plan: Plan, clock: str, whole: bool) -> RefereeReport:

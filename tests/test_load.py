@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from echelon.errors import one_line
 from echelon.explain import TEXTS, key_text, value_text
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.sim.parts import load, parse
 
 SCENARIOS = sorted((Path(__file__).resolve().parent.parent / "deploy" / "scenarios").glob("*.toml"))

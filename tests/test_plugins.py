@@ -10,7 +10,7 @@ from runs import SCENARIOS
 
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.trajectory import make_trajectory
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.plugins import PartRunError
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load

@@ -8,6 +8,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy reads it when it is loaded: its threads would only wait
+
 from echelon.errors import UserError, one_line
 
 DEBUG = "ECHELON_DEBUG"

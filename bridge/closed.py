@@ -12,10 +12,11 @@ from echelon.bridge.buses import bus_row, scheduled
 from echelon.bridge.canlog import CanLog
 from echelon.bridge.commander import Commander
 from echelon.bridge.fit import plan_fit
-from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame
+from echelon.bridge.frame_message import TimedFrame
 from echelon.bridge.on_bus import Rail, on_bus
 from echelon.bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.plan import Plan
+from echelon.plugins import PartRunError
 from echelon.role import Stage
 
 LOG: Final = "can.log"
@@ -70,16 +71,15 @@ class ClosedStation:
     def stop_wheels(self, time_ns: int) -> None:
         """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends.
 
-        At once, and past the models of buses that are as slow as real ones."""
+        At once, and past the models of buses that are as slow as real ones.  After that it raises PartRunError if a protocol
+        that others wrote failed at it."""
         self._robots = self.role.summary()
-        frames = [
-            TimedFrame(time_ns, robot.robot.drive.bus, BRIDGE_NODE, frame)
-            for robot in self.role.robots
-            for frame in robot.host.stop(time_ns)
-        ]
+        frames, failure = self.role.stop(time_ns)
         for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
             self.buses[bus].send(can_id, data, time_ns, remote)
         self.log(frames)
+        if failure:
+            raise PartRunError(failure)
 
     def close(self) -> None:
         """Closes log and buses."""

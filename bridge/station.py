@@ -15,7 +15,7 @@ from echelon.bridge.canlog import CanLog
 from echelon.bridge.fit import plan_fit
 from echelon.bridge.frame_message import BRIDGE_NODE, add_words
 from echelon.bridge.plan_dbc import dbc_names, plan_dbc
-from echelon.bridge.protocols import torque_frames
+from echelon.bridge.protocols import make_host
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
@@ -31,14 +31,12 @@ class Station:
     """
 
     def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
-        robots = [robot.path for robot in plan.robots]
         self._plan = plan
         self._bridge = Bridge(
-            robots,
-            plan.can.torque_scale,
+            [robot.path for robot in plan.robots],
+            [make_host(robot) for robot in plan.robots],
             [robot.period_ns for robot in plan.robots],
             [robot.envelope for robot in plan.robots],
-            {robot.index: torque_frames(robot) for robot in plan.robots if robot.drive.protocol != "native"},
         )
         self._buses = [open_bus(url) for url in urls]
         self.url = ", ".join(bus.url for bus in self._buses)
@@ -70,7 +68,7 @@ class Station:
                 time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
             )
             number = self._bus_of[source]
-            for identifier, data in frames:
+            for identifier, data, _ in frames:
                 buses[number].send(identifier, data, time_ns)
                 log.write(time_ns, identifier, data, wall_ns, names[number])
                 add_words(words, time_ns, number, BRIDGE_NODE, identifier, data)

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from echelon.part_fields import ProtocolField
 from echelon.values import (
     Bitrate,
     Constant,
@@ -24,17 +25,16 @@ from echelon.values import (
 class DriveTable(Table):
     """The drives of a robot's wheels, and their motors; both wheels have the same."""
 
-    protocol: Literal["native", "odrive", "cia402"] | None = None
-    """`native` (one frame for both wheels, counter and CRC), `odrive` (CANSimple 0.6) or `cia402` (cyclic synchronous
-    torque over CANopen)"""
+    protocol: ProtocolField = None
+    """By its name, as a table with `use` and `parameters`, or as "file.py:Class" (echelon.plugins)"""
     node_ids: tuple[NodeId, NodeId] | None = None
-    """Of the right and the left wheel's drive; by default two numbers of the robot's own"""
+    """Of the right and the left wheel's drive; unless given, the lowest whose identifiers nobody on the bus uses"""
     recover_after: Seconds | None = None
     """So long after a fault the bridge clears it and enables the drive anew [s]; never unless given"""
     torque_limit: Constant | None = None
     """Largest torque of the motor [N m]; the robot's limit unless given"""
     rated_torque: Constant | None = None
-    """Torque that the motor can give for ever [N m]; CiA 402 counts in thousandths of it"""
+    """Torque that the motor can give for ever [N m]"""
     torque_slew: Limit | None = None
     """Largest change of torque [N m/s]"""
     lag: ConstantOrZero | None = None
@@ -100,7 +100,7 @@ class Can(Table):
     buses: dict[Name, Bus] = {}
     """Several buses by name, each with a `url` and a `bitrate` of its own if need be; robots say theirs with `bus`"""
     torque_scale: Positive = 0.001
-    """Newton metres per bit of the native torque frame; ±32767 bits fit"""
+    """Newton metres per bit where a frame has torques as whole numbers; ±32767 bits fit"""
     path: Literal["mirror", "closed"] = "mirror"
     """`mirror`: the plant takes the computed torque, the bus shows it.  `closed`: the plant takes what the drives report,
     which is what they decoded from the frames"""
@@ -135,8 +135,8 @@ class DriveFault(Table):
 
 
 class Estop(Table):
-    """Emergency stop, each protocol's own (the native flag, ODrive's Estop, CiA 402's quick stop): drives take the torque away
-    by themselves and stay disabled, for good unless it has a `duration`."""
+    """Emergency stop, each protocol's own: drives take the torque away by themselves and stay disabled, for good unless it has
+    a `duration`."""
 
     kind: Literal["estop"]
     at: SecondsOrZero

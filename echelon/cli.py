@@ -166,6 +166,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except commands.UsageError as error:
             print(f"echelon: {error}", file=sys.stderr)
             return 2
+        except commands.PartRunError as error:
+            print(f"echelon: {error}", file=sys.stderr)
+            return 3
     except BrokenPipeError:  # a reader such as head that has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0

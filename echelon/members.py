@@ -8,6 +8,7 @@ from typing import Any, Final, TypeVar
 
 from echelon import shapes
 from echelon.can_plan import CanPlan
+from echelon.can_tables import DriveTable
 from echelon.drives import DriveMaker, make_can
 from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.plugins import Part, Registry
@@ -24,7 +25,7 @@ DEFAULT_PLANT: Final = "paper"
 NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
 """What must be said of every robot, on some level."""
 MAX_ROBOTS: Final = 127
-"""As many as the native torque frame has identifiers for."""
+"""As many as a bus has identifiers for where each robot has three of its own."""
 MAX_NS: Final = 2**62
 """146 years: sums of two instants still fit the message header."""
 
@@ -48,12 +49,12 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
         acceleration_ns=nanoseconds(scenario.periods.acceleration, "periods.acceleration"),
         torque_ns=torque_ns,
         first_node=count,
-        drives=DriveMaker(scenario.can, can),
+        drives=DriveMaker(scenario.can, can, registry.default("protocols")),
         closed=can.closed,
         default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
-    return tuple(walk.robots), tuple(walk.nodes), can
+    return walk.drives.placed(walk.robots), tuple(walk.nodes), can
 
 
 def robot_key(path: str) -> str:
@@ -94,7 +95,7 @@ class _Walk:
         default_plant: Part[Any],
     ) -> None:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
-        self._drives, self._closed, self._default_plant = drives, closed, default_plant
+        self.drives, self._closed, self._default_plant = drives, closed, default_plant
         self.robots: list[RobotPlan] = []
         self.nodes: list[NodePlan] = []
 
@@ -140,7 +141,7 @@ class _Walk:
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model"})
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
         for needed in NEEDED:
             if needed not in values:
                 raise PlanError(f"{place.key}.{needed}: missing (neither here, nor in its group, nor in [robot])")
@@ -156,8 +157,8 @@ class _Walk:
         cycle_ns = self._torque_ns if self._closed else period_ns
         return RobotPlan(
             index=index,
-            envelope=self._drives.envelope(values),
-            drive=self._drives.drive(values, place.key, index, place.path, cycle_ns),
+            envelope=self.drives.envelope(values),
+            drive=self.drives.drive(table.drive or DriveTable(), values, place.key, index, place.path, cycle_ns),
             path=place.path,
             parent=place.parent,
             child_number=place.child_number,

@@ -4,6 +4,7 @@
     trajectory = { use = "my_paths.py:Spiral", parameters = { rate = 0.2 } }         the same for any part
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
+    robot.drive.protocol = "odrive"
 
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
@@ -118,9 +119,16 @@ def _written_by_name(part: Part[Any] | None) -> Any:
 TrajectoryField = Annotated[
     Part[Any], PlainValidator(_inline("trajectories")), PlainSerializer(_written_inline), WithJsonSchema(_SCHEMA)
 ]
+_NAME_SCHEMA: Final = {"anyOf": [{"type": "string"}, _SCHEMA]}
 PlantField = Annotated[
     Part[Any] | None,
     PlainValidator(_by_name("plants")),
     PlainSerializer(_written_by_name),
-    WithJsonSchema({"anyOf": [{"type": "string"}, _SCHEMA]}),
+    WithJsonSchema(_NAME_SCHEMA),
+]
+ProtocolField = Annotated[
+    Part[Any] | None,
+    PlainValidator(_by_name("protocols")),
+    PlainSerializer(_written_by_name),
+    WithJsonSchema(_NAME_SCHEMA),
 ]

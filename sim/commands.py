@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from echelon.plugins import PartRunError
 from echelon.sim.usage import UsageError, scenario_of
+
+__all__ = ["PartRunError", "UsageError"]
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from typing import Final
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command
 from echelon.bridge.drive_bank import DriveBank
-from echelon.drives import identifiers
+from echelon.bridge.protocols import protocol_of
 from echelon.plan import Plan, RobotPlan
 from echelon.sim.wall import RunClock
 from echelon.sim.wall_drives import WallDrives
@@ -39,10 +39,7 @@ def describe(plan: Plan, urls: Sequence[str]) -> list[str]:
 
 def _place(plan: Plan, robot: RobotPlan) -> str:
     drive, bus = robot.drive, plan.can.buses[robot.drive.bus].name
-    if drive.protocol != "native":
-        return f"{drive.protocol} on {bus}, nodes {drive.node_ids[0]} right, {drive.node_ids[1]} left"
-    command, feedback, status = sorted(identifiers(drive, robot.index)[0])
-    return f"native on {bus}, command {command:#05x}, feedback {feedback:#05x}, status {status:#05x}"
+    return f"{drive.protocol.use} on {bus}, {protocol_of(robot).place(drive)}"
 
 
 def run_drives(plan: Plan, urls: Sequence[str], seconds: float | None, say: Callable[[str], None]) -> None:

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Final
 
+from echelon.plugins import PartRunError
 from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.engine import make_role
@@ -53,7 +54,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
             body(spec, session, control)
     except SystemExit:
         os._exit(0)
-    except StartError as error:
+    except (StartError, PartRunError) as error:
         control.send(("failed", str(error)))
         os._exit(1)
     except BaseException:

@@ -17,10 +17,12 @@ from echelon.bridge.frame_message import frames_of
 from echelon.load import effective_toml
 from echelon.messages import Channel
 from echelon.plan import Plan
+from echelon.plugins import PartRunError
 from echelon.scenario import Scenario
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display
 from echelon.sim.merge import TimeOrder
+from echelon.sim.parts import write_files
 from echelon.sim.summary import summarise, write
 from echelon.sim.supervisor import Outcome, Progress, Supervisor
 from echelon.sim.trace import Trace
@@ -74,6 +76,7 @@ def execute(
     ValueError too if, in one process, the bus cannot be had."""
     toml = effective_toml(scenario)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
+    write_files(plan, folder)
     metadata = {
         "scenario": scenario.name,
         "engine": engine,
@@ -96,7 +99,10 @@ def execute(
             stall_timeout_s=stall_timeout_s,
         ).run()
     if outcome.can and "referee" not in outcome.can:
-        outcome.can["referee"] = judged(folder / "can.log", plan, clock, whole=not outcome.failure)
+        try:
+            outcome.can["referee"] = judged(folder / "can.log", plan, clock, whole=not outcome.failure)
+        except PartRunError as error:
+            outcome.failure = outcome.failure or str(error)
     display.close()
     summary = summarise(outcome.trace, outcome.links, outcome.can, _run_facts(plan, outcome, engine, clock))
     if outcome.failure:
@@ -174,6 +180,8 @@ def _in_process(
             if recording.recorder.failure:
                 failure = f"the recording failed: {recording.recorder.failure}"
                 break
+    except PartRunError as error:
+        failure = str(error)
     except KeyboardInterrupt:
         failure = "interrupted"
         if plan.stations:
@@ -181,13 +189,16 @@ def _in_process(
     wall_s = time.monotonic() - begun_s
     try:
         pass_on()
-    except SystemExit:
+    except (SystemExit, PartRunError):
         pass
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
-    if plan.stations:
-        station.stop_wheels(station.role.next_ns)
+    try:
+        if plan.stations:
+            station.stop_wheels(station.role.next_ns)
+    except PartRunError as error:
+        failure = failure or str(error)
     if station is not None:
         station.close()
     result = recording.result()

@@ -14,6 +14,7 @@ from echelon.bridge.bus import open_bus
 from echelon.bridge.closed import ClosedStation
 from echelon.bridge.drive_bank import DriveBank
 from echelon.bridge.on_bus import BusError, Rail, on_bus
+from echelon.plugins import PartRunError
 from echelon.role import Role, Stage
 from echelon.runner import Runner
 from echelon.session import Session
@@ -77,20 +78,26 @@ def run_station(spec: ProcessSpec, session: Session, control: Connection) -> Non
     done = threading.Event()
     teller = threading.Thread(target=_tell, args=(station, say, done), name="progress", daemon=True)
     teller.start()
+    failure = ""
     try:
         runner.lockstep(lambda time_ns, sources: say(("waiting", time_ns, sources)))
     except SystemExit:  # the run breaks off; what was counted so far is to be told
         pass
-    except BusError as error:
-        say(("failed", str(error)))
-        raise SystemExit(1) from None
+    except (BusError, PartRunError) as error:
+        failure = str(error)
     finally:
         runner.finish()
         done.set()
         teller.join()
-        if isinstance(station, ClosedStation):
-            station.stop_wheels(station.role.next_ns)
+        try:
+            if isinstance(station, ClosedStation):
+                station.stop_wheels(station.role.next_ns)
+        except PartRunError as error:
+            failure = failure or str(error)
         station.close()
+    if failure:
+        say(("failed", failure))
+        raise SystemExit(1)
     cpu_s, resident = resources()
     links = tuple(runner.mailbox.counts())
     say(("done", Result(spec.name, cpu_s, resident, runner.counts, links, station.result())))

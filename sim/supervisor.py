@@ -193,7 +193,12 @@ class Supervisor:
             case "progress":
                 progress.can.update(rest[0])
             case "failed":
-                raise RunError(f"{child.spec.kind} {child.name} cannot start: {rest[0]}")
+                starting = self.progress.phase == "starting"
+                raise RunError(
+                    f"{child.spec.kind} {child.name} cannot start: {rest[0]}"
+                    if starting
+                    else f"{child.name}: {rest[0]}"
+                )
             case "done":
                 child.result = rest[0]
 

@@ -252,8 +252,20 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     except (ValueError, OSError) as error:
         raise StartError(str(error)) from None
     control.send(("bus", bridge.station.url))
-    clock = bridge.clock = RunClock(meet(spec, session, control))
-    said_ns = -1 << 62
+    bridge.clock = RunClock(meet(spec, session, control))
+    try:
+        _serve(bridge, control)
+    finally:  # however it ends
+        bridge.stop(bridge.clock.now())
+    bridge.station.close()
+    cpu_s, resident = resources()
+    control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))
+    control.recv()
+
+
+def _serve(bridge: WallBridge, control: Connection) -> None:
+    """Does the bridge's work until it is told to finish."""
+    clock, said_ns = bridge.clock, -1 << 62
     while True:
         # What drives say is of use when a period has ended; until then it can wait for the next torque.
         buses = bridge.station.buses if bridge.listens else ()
@@ -270,8 +282,3 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
             control.recv()
             break
     bridge.frames(clock.now())
-    bridge.stop(clock.now())
-    bridge.station.close()
-    cpu_s, resident = resources()
-    control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))
-    control.recv()

@@ -22,7 +22,7 @@ from echelon.plan import Plan, RobotPlan
 
 def try_protocols(plan: Plan) -> None:
     """Makes hosts, drives, observers, masters and DBC messages of one robot for each protocol that others wrote."""
-    others = {id(robot.drive.protocol): robot for robot in plan.robots if not robot.drive.protocol.is_own}
+    others = {id(robot.drive.protocol): robot for robot in reversed(plan.robots) if not robot.drive.protocol.is_own}
     for robot in others.values():
         _try_robot(plan, robot)
     if others:

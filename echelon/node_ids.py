@@ -106,6 +106,7 @@ class _Bus:
                 if found := self._take(self._identifiers(place, node), f"those of {place.path}"):
                     collisions.append((place, found))
         for place, found in collisions:  # now that all that is given is known, so is what is free
+            self._users = {can_id: user for can_id, user in self._users.items() if user != f"those of {place.path}"}
             free = self._free(place)
             more = ", …" if len(free) > SHOWN else ""
             shown = f"free are {', '.join(map(str, free[:SHOWN]))}{more}" if free else "none is free"

@@ -256,8 +256,10 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     try:
         _serve(bridge, control)
     finally:  # however it ends
-        bridge.stop(bridge.clock.now())
-    bridge.station.close()
+        try:
+            bridge.stop(bridge.clock.now())
+        finally:
+            bridge.station.close()
     cpu_s, resident = resources()
     control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))
     control.recv()

@@ -10,7 +10,7 @@ Feedback is a sample of its instant: the plant, which is not on the bus, takes i
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from echelon.bridge.frame import Frame, Host
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
 from echelon.bridge.ideal_bus import IdealBus
 from echelon.bridge.protocols import drive_places, make_host, make_masters
+from echelon.bridge.reports import WheelsReport
 from echelon.bridge.schedule import Schedule
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
@@ -41,7 +42,7 @@ def _fresh(message: Heard, time_ns: int) -> list[TimedFrame]:
     return [] if message is None or message.time_ns != time_ns else unpack(message.values)
 
 
-class Torques:
+class RobotChannel:
     """The way of one robot's torques to its drives: envelope, then host; counts what it stopped, and why."""
 
     def __init__(self, robot: RobotPlan) -> None:
@@ -104,17 +105,17 @@ class Torques:
         except PartRunError:
             return [], failure  # the drives' own watchdogs are left
 
-    def summary(self) -> dict[str, Any]:
+    def report(self) -> WheelsReport:
         """Returns the counts."""
-        return {
-            "protocol": self.robot.drive.protocol.use,
-            "commands": self.commands,
-            "stopped": dict(sorted(self.stopped.items())),
-            "refused": dict(sorted(self.host.refused.items())),
-            "largest": self.largest,
-            "enabled": self.host.enabled,
-            "fault": self.host.fault,
-        }
+        return WheelsReport(
+            protocol=self.robot.drive.protocol.use,
+            commands=self.commands,
+            stopped=dict(sorted(self.stopped.items())),
+            largest=self.largest,
+            refused=dict(sorted(self.host.refused.items())),
+            enabled=self.host.enabled,
+            fault=self.host.fault,
+        )
 
 
 class Commander:
@@ -129,7 +130,7 @@ class Commander:
         self._period_ns = bridge.period_ns
         self.next_ns = bridge.first_ns
         """End of the last period that frames were made for"""
-        self.robots = [Torques(robot) for robot in plan.robots]
+        self.robots = [RobotChannel(robot) for robot in plan.robots]
         self.buses: list[BusTime | IdealBus] = make_buses(plan)
         self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
         for robot in self.robots:
@@ -263,6 +264,6 @@ class Commander:
         self._disturbances.apply(time_ns)
         return frames
 
-    def summary(self) -> dict[str, Any]:
-        """Returns what the bridge saw of every robot."""
-        return {robot.robot.name: robot.summary() for robot in self.robots}
+    def reports(self) -> dict[str, WheelsReport]:
+        """Returns the reports of all robots, by name."""
+        return {robot.robot.name: robot.report() for robot in self.robots}

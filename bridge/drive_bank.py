@@ -7,13 +7,14 @@ turn as the robots say; the torque that reaches a robot is what its drives repor
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
-from echelon.bridge.buses import lost_row
+from echelon.bridge.buses import lost_report
 from echelon.bridge.frame import Drive, Frame
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
 from echelon.bridge.motor import Fault
 from echelon.bridge.protocols import DrivePlace, drive_places, make_drive
+from echelon.bridge.reports import DriveReport, DrivesReport
 from echelon.bridge.schedule import Schedule
 from echelon.can_plan import NEVER_NS
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
@@ -194,25 +195,21 @@ class DriveBank:
     def _drive_of(self, robot: int, wheel: int) -> PlacedDrive:
         return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
-    def result(self) -> dict[str, Any]:
-        """Returns what there is to say of the drives for a run's summary."""
-        return {"robots": self.summary(), "refused": dict(self.refused)}
-
-    def lost_rows(self) -> list[dict[str, Any]]:
-        """Returns what was lost before it came to a bus, bus by bus, for `bridge.buses.merge_rows`."""
+    def report(self) -> DrivesReport:
+        """Returns the report of all drives; its buses hold the frames that were lost before they came to a bus."""
         lost: list[Counter[int]] = [Counter() for _ in self._plan.can.buses]
         for placed in self.drives:
             lost[placed.place.bus] += placed.lost
-        return [lost_row(of_bus) for of_bus in lost]
+        return DrivesReport(
+            robots={robot.name: self._robot_report(robot.index) for robot in self._plan.robots},
+            refused=dict(self.refused),
+            buses=tuple(lost_report(self._plan, number, of_bus) for number, of_bus in enumerate(lost)),
+        )
 
-    def summary(self) -> dict[str, Any]:
-        """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""
-        rows: dict[str, dict[str, Any]] = {
-            robot.name: {"refused": Counter[str](), "lost": 0, "temperature": 0.0} for robot in self._plan.robots
-        }
-        for placed in self.drives:
-            row = rows[self._plan.robots[placed.place.robot].name]
-            row["refused"] += placed.drive.refused
-            row["lost"] += placed.lost.total()
-            row["temperature"] = max(row["temperature"], *(motor.temperature for motor in placed.drive.motors))
-        return rows
+    def _robot_report(self, robot: int) -> DriveReport:
+        placed = self._of_robot[robot]
+        return DriveReport(
+            refused=sum((one.drive.refused for one in placed), Counter[str]()),
+            lost=sum(one.lost.total() for one in placed),
+            temperature=max(0.0, *(motor.temperature for one in placed for motor in one.drive.motors)),
+        )

@@ -18,8 +18,9 @@ from typing import Any, Final
 
 from echelon.plan import Plan, RobotPlan
 from echelon.session import loopback_endpoints
-from echelon.sim.joining import ProcessSpec, Result
+from echelon.sim.contract import ProcessSpec
 from echelon.sim.process import main
+from echelon.sim.to_supervisor import Done
 
 PRELOAD: Final = ["echelon.sim.process"]
 LAST_WORDS: Final = 4000
@@ -40,7 +41,7 @@ class Child:
     """Its standard output and standard error"""
     heard_s: float
     ready: bool = False
-    result: Result | None = None
+    done: Done | None = None
     waiting_for: list[int] = field(default_factory=list)
     waiting_ns: int = -1
     said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))

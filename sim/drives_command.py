@@ -13,9 +13,9 @@ from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command
 from echelon.bridge.drive_bank import DriveBank
 from echelon.bridge.protocols import protocol_of
+from echelon.bridge.stations.waiting import RunClock
+from echelon.bridge.stations.wall_drives import WallDrives
 from echelon.plan import Plan, RobotPlan
-from echelon.sim.wall import RunClock
-from echelon.sim.wall_drives import WallDrives
 
 LINE_S: Final = 1.0
 """Between two lines."""

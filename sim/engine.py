@@ -7,6 +7,7 @@ robots move.  What the roles hear goes through the same mailboxes, and so throug
 from collections.abc import Callable, Iterator
 from itertools import groupby
 from math import gcd
+from typing import TYPE_CHECKING, cast
 
 from echelon.agents.robot import make_robot
 from echelon.controller.node import TreeNode
@@ -15,6 +16,10 @@ from echelon.mailbox import Mailbox
 from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.role import Role
+
+if TYPE_CHECKING:
+    from echelon.bridge.commander import Commander
+    from echelon.bridge.drive_bank import DriveBank
 
 Sink = Callable[[Message], None]
 
@@ -62,6 +67,16 @@ class Engine:
         ]
         self._tick_ns = gcd(*[period for period, _, _ in self._stages])
         self._first_ns = min(first for _, first, _ in self._stages)
+
+    @property
+    def commander(self) -> "Commander | None":
+        """The role of the bridge, where the torque path is closed."""
+        return cast("Commander", self.roles[self.plan.stations[0].index]) if self.plan.stations else None
+
+    @property
+    def drives(self) -> "DriveBank | None":
+        """The role of the virtual drives, where there are any."""
+        return cast("DriveBank", self.roles[self.plan.stations[1].index]) if self.plan.stations[1:] else None
 
     def instants(self) -> Iterator[int]:
         """Runs the whole plan, from 0 (or from when drives are brought up) to its duration inclusive; yields each instant

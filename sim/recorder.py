@@ -3,6 +3,7 @@
 Every time in the file is the run's own, so the same run gives the same bytes.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -79,7 +80,7 @@ class Recorder:
             self._file.add(self._numbers[self._frame_topics[bus]], self._frames[bus], time_ns, frame)
             self._frames[bus] += 1
 
-    def record_links(self, time_ns: int, links: list[LinkCounts]) -> None:
+    def record_links(self, time_ns: int, links: Sequence[LinkCounts]) -> None:
         """Takes the counts of links at an instant."""
         members = self._plan.everyone
         for counts in links if self._file.failure is None else ():

@@ -11,7 +11,7 @@ from typing import Any
 from echelon.plan import Plan
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load
-from echelon.sim.trace import Trace, TraceBuilder
+from echelon.sim.results.trace import Trace, TraceBuilder
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIOS = ROOT / "deploy" / "scenarios"

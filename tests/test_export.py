@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from synthetic import FIELD, decaying, link_counts
 
-from echelon.sim.blocks import block_series
 from echelon.sim.export import ROBOT_FIELDS, export_csv
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import block_series
+from echelon.sim.results.trace import Trace
 
 
 @pytest.fixture(scope="module")

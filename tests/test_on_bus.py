@@ -6,11 +6,11 @@ from itertools import count
 
 import pytest
 
-from echelon.bridge import on_bus as on_bus_module
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.frame import Frame
 from echelon.bridge.frame_message import NO_BUS, TimedFrame, pack
-from echelon.bridge.on_bus import BusError, Rail, on_bus
+from echelon.bridge.stations import rail as on_bus_module
+from echelon.bridge.stations.rail import BusError, Rail, on_bus
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 

@@ -187,8 +187,8 @@ def test_all_protocols_on_one_bus_by_default(uses: tuple[str, ...], tmp_path: Pa
     sets = [argument for override in overrides for argument in ("--set", override)]
     done = echelon("run", "lab", "--engine", "inprocess", "--quiet", "--no-report", "--out", tmp_path, *sets)
     assert done.returncode == 0, done.stderr
-    summary = judge_log(tmp_path / "can.log", plan_of("lab", *overrides))
-    assert (summary["findings"], summary["unknown"]) == ([], 0)
+    report = judge_log(tmp_path / "can.log", plan_of("lab", *overrides))
+    assert (report.findings, report.unknown) == ((), 0)
     log = (tmp_path / "can.log").read_text()
     decode = [sys.executable, "-m", "cantools", "decode", "--single-line", str(tmp_path / "torque.dbc")]
     run = subprocess.run(decode, input=log, capture_output=True, text=True, check=True, timeout=60)

@@ -23,7 +23,7 @@ from echelon.role import Role, Stage
 from echelon.runner import MAX_BATCHES, Runner
 from echelon.session import Receive
 from echelon.sim.engine import Engine, make_role
-from echelon.sim.trace import TraceBuilder
+from echelon.sim.results.trace import TraceBuilder
 from echelon.wire import data_key, decode, encode, split
 
 RUN = "test"

@@ -14,7 +14,7 @@ from echelon.bridge.frame_message import TimedFrame, pack
 from echelon.messages import Channel, Message
 from echelon.sim import watchers
 from echelon.sim.recording import read_metadata, read_trace
-from echelon.sim.watchers import Reception, Recording
+from echelon.sim.watchers import Reception, RunRecorder
 from echelon.wire import encode, join
 
 TICKS = 6
@@ -95,8 +95,8 @@ def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.Monk
 
 
 def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
-    recording = Recording(tmp_path, paper(), "scenario", METADATA)
-    assert recording.progress()["states"] is None
+    recording = RunRecorder(tmp_path, paper(), "scenario", METADATA)
+    assert recording.progress().states is None
     messages = list(invented(paper(), TICKS))
     end_ns = messages[-1].time_ns
     timed = TimedFrame(end_ns, 0, 0, Frame(0x101, bytes(range(8))))
@@ -105,10 +105,10 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
     recording.add([])
     recording.add([frames])
     progress = recording.progress()
-    assert progress["time_ns"] == progress["states_ns"] == messages[-1].time_ns
-    assert (progress["messages"], progress["failure"]) == (len(messages) + 1, None)
+    assert progress.time_ns == progress.states_ns == messages[-1].time_ns
+    assert (progress.messages, progress.failure) == (len(messages) + 1, None)
     recording.close([])
-    result = recording.result()
-    assert (result["messages"], result["failure"]) == (len(messages) + 1, None)
-    assert read_trace(tmp_path / "run.mcap", paper()).digest() == result["trace"].digest()
+    result = recording.report()
+    assert (result.messages, result.failure) == (len(messages) + 1, None)
+    assert read_trace(tmp_path / "run.mcap", paper()).digest() == result.trace.digest()
     assert read_metadata(tmp_path / "run.mcap") == METADATA

@@ -1,4 +1,4 @@
-"""The bridge where torque is mirrored: wheel torques in, CAN frames out, and what there is to know about them. Pure.
+"""Torque that is mirrored: wheel torques in, CAN frames out, counted robot by robot. Pure.
 
 Each robot sends its torques once per acceleration period, and each becomes one frame at once; nothing is held back, so
 torques in the order (time, robot) give frames in that order. What must not reach a wheel becomes a frame with zero
@@ -7,15 +7,14 @@ does not let pass.
 """
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
 
 from echelon.bridge.bus_load import BitCount
 from echelon.bridge.envelope import Envelope
 from echelon.bridge.frame import Frame, Host
+from echelon.bridge.reports import WheelsReport
 from echelon.can_plan import EnvelopePlan
 
 
@@ -30,10 +29,10 @@ class Stop(StrEnum):
 
 @dataclass(slots=True)
 class RobotCounts:
-    """What the bridge saw of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
+    """What was seen of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
 
     frames: int = 0
-    stopped: dict[StrEnum, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
+    stopped: dict[str, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
     repeated: int = 0  # torques for a period that had its frame: no frame
     skipped: int = 0  # periods without torques between two that had them
     clipped: int = 0  # frames in which a torque was cut to the range of the frame
@@ -41,19 +40,18 @@ class RobotCounts:
     smallest: tuple[float, float] = (math.inf, math.inf)
     largest: tuple[float, float] = (-math.inf, -math.inf)
     last_ns: int | None = None  # the newest torques turned into a frame
+    bits: BitCount = field(default_factory=BitCount)  # that its frames would take on a real bus
 
 
-class Bridge:
+class TorqueMirror:
     """Turns torques into frames.
 
-    Parameters: the robots' path names in the order of their numbers, their hosts, the acceleration period [ns], and the
-    robots' envelopes (none: no limits). Raises ValueError for a period that is not positive."""
+    Parameters: the robots' hosts in the order of their numbers, the acceleration period [ns], and the robots' envelopes
+    (none: no limits). Raises ValueError for a period that is not positive."""
 
     __slots__ = (
-        "_bits",
         "_envelopes",
         "_hosts",
-        "_names",
         "_period_ns",
         "counts",
         "frames",
@@ -61,21 +59,18 @@ class Bridge:
 
     def __init__(
         self,
-        robots: Sequence[str],
         hosts: Sequence[Host],
         period_ns: int | Sequence[int],
         envelopes: Sequence[EnvelopePlan] = (),
     ) -> None:
-        periods = [period_ns] * len(robots) if isinstance(period_ns, int) else list(period_ns)
-        if len(periods) != len(robots) or min(periods, default=1) <= 0:
-            raise ValueError(f"periods must be positive, one for each of {len(robots)} robots, not {period_ns!r} ns")
-        self._names = tuple(robots)
+        periods = [period_ns] * len(hosts) if isinstance(period_ns, int) else list(period_ns)
+        if len(periods) != len(hosts) or min(periods, default=1) <= 0:
+            raise ValueError(f"periods must be positive, one for each of {len(hosts)} robots, not {period_ns!r} ns")
         self._hosts = tuple(hosts)
         self._period_ns = periods
         self._envelopes = [Envelope(plan) for plan in envelopes]
-        self.counts = [RobotCounts() for _ in robots]
+        self.counts = [RobotCounts() for _ in hosts]
         self.frames = 0
-        self._bits = BitCount()
 
     def encode(
         self, time_ns: int, robot: int, tau_right: float, tau_left: float, saturated: bool = False
@@ -83,7 +78,7 @@ class Bridge:
         """The frame for the torques [N m] that robot number `robot` commands at `time_ns`.
 
         Torques not finite, or older than the last ones, give a frame that stops the robot's drives; a second set of
-        torques for one instant gives none. Raises IndexError for a robot the bridge does not have."""
+        torques for one instant gives none. Raises IndexError for a robot it does not have."""
         counts = self.counts[robot]
         last = counts.last_ns
         if last is not None and time_ns <= last:
@@ -115,40 +110,30 @@ class Bridge:
     def stop(self, robot: int, why: StrEnum = Stop.REQUESTED) -> list[Frame]:
         """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
         counts = self.counts[robot]
-        counts.stopped[why] = counts.stopped.get(why, 0) + 1
+        counts.stopped[why.value] = counts.stopped.get(why.value, 0) + 1
         if self._envelopes and counts.last_ns is not None:
             self._envelopes[robot].stop(counts.last_ns)
         return self._send(robot, self._hosts[robot].mirror(0.0, 0.0, False))
 
     def _send(self, robot: int, frames: list[Frame]) -> list[Frame]:
-        self.counts[robot].frames += len(frames)
+        counts = self.counts[robot]
+        counts.frames += len(frames)
         self.frames += len(frames)
         for can_id, data, _ in frames:
-            self._bits.add(can_id, data)
+            counts.bits.add(can_id, data)
         return frames
 
-    def stopped(self) -> Counter[str]:
-        """How many torques did not reach a wheel, by reason, over all robots."""
-        return sum((Counter(counts.stopped) for counts in self.counts), Counter[str]())
-
-    @property
-    def bits(self) -> int:
-        """Bits that all frames so far would take on a real bus, stuff bits and interframe space included."""
-        return self._bits.bits
-
-    def summary(self) -> dict[str, Any]:
-        """All counts, ready for JSON: totals, and one entry for each robot under its path name."""
-        robots = {}
-        for name, counts in zip(self._names, self.counts, strict=True):
-            commanded = counts.smallest[0] <= counts.largest[0]
-            robots[name] = {
-                "frames": counts.frames,
-                "stopped": {why.value: number for why, number in sorted(counts.stopped.items())},
-                "repeated": counts.repeated,
-                "skipped": counts.skipped,
-                "clipped": counts.clipped,
-                "saturated": counts.saturated,
-                "torque_min": list(counts.smallest) if commanded else None,
-                "torque_max": list(counts.largest) if commanded else None,
-            }
-        return {"frames": self.frames, "bits": self.bits, "robots": robots}
+    def report(self, robot: int, protocol: str) -> WheelsReport:
+        """Returns the counts of a robot whose drives speak `protocol`."""
+        counts = self.counts[robot]
+        commanded = (*counts.smallest, *counts.largest) if counts.smallest[0] <= counts.largest[0] else (0.0,)
+        return WheelsReport(
+            protocol=protocol,
+            commands=counts.frames,
+            stopped=dict(sorted(counts.stopped.items())),
+            largest=max(map(abs, commanded)),
+            clipped=counts.clipped,
+            saturated=counts.saturated,
+            repeated=counts.repeated,
+            skipped=counts.skipped,
+        )

@@ -6,7 +6,7 @@ On each bus identifiers are taken in this order:
 2. those of robots whose node id is their number;
 3. those of node ids that the scenario gives;
 4. the rest: the lowest node ids that are free.  Drives whose identifiers lie furthest apart choose first, for they have the
-   least choice: an ODrive has 32 identifiers in a row, a CANopen node has one in each of twelve places.
+   least choice: where one protocol has 32 identifiers in a row, another has one in each of twelve places.
 
 Node 0 is never chosen: it is what a new drive has.
 """
@@ -116,15 +116,16 @@ class _Bus:
     def _lowest(self, places: Sequence[Place]) -> dict[int, tuple[int, int]]:
         chosen = {}
         for place in sorted(places, key=self._spread, reverse=True):
-            nodes = self._free(place)[: len(place.addressing.wheels)]
-            if len(nodes) < len(place.addressing.wheels):
-                raise PlanError(
-                    f"{place.key}.node_ids: {_needed(place)} for {place.protocol.use}, and no more are free; put some "
-                    "robots on another bus (can.buses)"
-                )
+            nodes = []
+            for _ in place.addressing.wheels:
+                if not (free := self._free(place)):
+                    raise PlanError(
+                        f"{place.key}.node_ids: {_needed(place)} for {place.protocol.use}, and no more are free; put some "
+                        "robots on another bus (can.buses)"
+                    )
+                nodes.append(free[0])
+                self._take(self._identifiers(place, free[0]), f"those of {place.path}")
             chosen[place.robot] = nodes[0], nodes[-1]
-            for node in nodes:
-                self._take(self._identifiers(place, node), f"those of {place.path}")
         return chosen
 
     def _identifiers(self, place: Place, node: int) -> frozenset[int]:

@@ -14,9 +14,12 @@ import pytest
 from bench.can import bus_rates
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command, resolve_url
+from echelon.bridge.frame import Frame
 from echelon.bridge.native.codec import NativeCodec, Torque
-from echelon.bridge.torque_mirror import Frame, TorqueMirror
+from echelon.bridge.native.host import NativeHost
+from echelon.bridge.torque_mirror import TorqueMirror
 from echelon.sim.can_checks import check_interfaces, check_vcan
+from tests.bench_drives import drive_plan
 from tests.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan
@@ -43,7 +46,7 @@ def listener(interface: str = "vcan0") -> socket.socket:
 
 def next_frame(raw: socket.socket) -> Frame:
     can_id, length, data = struct.unpack("=IB3x8s", raw.recv(16))
-    return can_id, data[:length]
+    return Frame(can_id, data[:length])
 
 
 def torques(step: int, robot: int) -> tuple[float, float]:
@@ -52,13 +55,14 @@ def torques(step: int, robot: int) -> tuple[float, float]:
 
 def run(bus: Bus) -> list[Frame]:
     """Sends STEPS periods of all robots through a bridge."""
-    bridge = TorqueMirror(ROBOTS, SCALE, 10_000_000)
+    plans = [drive_plan("native", (robot, robot), torque_scale=SCALE) for robot in range(len(ROBOTS))]
+    bridge = TorqueMirror([NativeHost(plan) for plan in plans], 10_000_000)
     sent = []
     for step in range(STEPS):
         for robot in range(len(ROBOTS)):
-            for can_id, data in bridge.encode(step * 10_000_000, robot, *torques(step, robot)):
-                bus.send(can_id, data, step * 10_000_000)
-                sent.append((can_id, data))
+            for frame in bridge.encode(step * 10_000_000, robot, *torques(step, robot)):
+                bus.send(frame.can_id, frame.data, step * 10_000_000)
+                sent.append(frame)
     assert len(sent) == bridge.frames == STEPS * len(ROBOTS) >= 2000
     return sent
 
@@ -72,7 +76,7 @@ def test_an_independent_socket_gets_every_frame(bus: Bus) -> None:
             raw.recv(16)
     assert (bus.counts.sent, bus.counts.failed, bus.counts.dropped) == (len(sent), 0, 0)
     codec = NativeCodec(SCALE)
-    for number, (can_id, data) in enumerate(sent):
+    for number, (can_id, data, _) in enumerate(sent):
         step, robot = divmod(number, len(ROBOTS))
         frame, (right, left) = codec.decode(can_id, data), torques(step, robot)
         assert isinstance(frame, Torque)

@@ -51,7 +51,8 @@ class Robots:
 
     def __init__(self) -> None:
         plan = lab()[1]
-        self.period_ns = plan.stations[0].period_ns
+        assert plan.bridge is not None
+        self.period_ns = plan.bridge.period_ns
         self.robots = [
             RobotChannel(replace(robot, drive=replace(robot.drive, watchdog_ns=NEVER_NS))) for robot in plan.robots
         ]

@@ -30,6 +30,7 @@ from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
 from echelon.plugins import PartRunError
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 _COMMANDED: Final = TORQUE_FIELDS.index("commanded")
 _SATURATED: Final = TORQUE_FIELDS.index("saturated")
@@ -124,7 +125,8 @@ class Commander:
     Its models of the buses have the drives' controllers in them too, unless `alone`."""
 
     def __init__(self, plan: Plan, *, alone: bool = False) -> None:
-        bridge = plan.stations[0]
+        bridge = plan.bridge
+        assert bridge is not None
         self.index = bridge.index
         self._first_ns = bridge.first_ns
         self._period_ns = bridge.period_ns
@@ -147,12 +149,11 @@ class Commander:
         """How many events of each bus drives have been told of"""
         self.refused: Counter[str] = Counter()
         """What came as messages and cannot be"""
-        deepest = max(node.depth for node in plan.nodes)
-        heard = tuple(Input(station.index, Channel.FRAMES) for station in plan.stations[1:])
+        reports = () if plan.drives is None else (Input(plan.drives.index, Channel.FRAMES),)
         torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
         self.stages = (
-            Stage("hear", -2, self._period_ns, heard, self._hear, self._first_ns),
-            Stage("send", 2 * deepest + 4, self._period_ns, torques, self._send, self._first_ns),
+            Stage(Turn.HEAR, self._period_ns, reports, self._hear, self._first_ns),
+            Stage(Turn.SEND, self._period_ns, torques, self._send, self._first_ns),
         )
 
     def _hear(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:

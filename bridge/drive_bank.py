@@ -20,6 +20,7 @@ from echelon.can_plan import NEVER_NS
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 _SPEED = TORQUE_FIELDS.index("speed_right")
 FASTEST: Final = 1e6
@@ -56,7 +57,9 @@ class DriveBank:
     """All virtual drives of a plan, on all its buses."""
 
     def __init__(self, plan: Plan) -> None:
-        bridge, drives = plan.stations
+        bridge, drives = plan.bridge, plan.drives
+        assert bridge is not None
+        assert drives is not None
         self.index = drives.index
         self._first_ns = drives.first_ns
         self._plan = plan
@@ -76,18 +79,11 @@ class DriveBank:
         self._of_robot: list[list[PlacedDrive]] = [[] for _ in plan.robots]
         for placed in self.drives:
             self._of_robot[placed.place.robot].append(placed)
-        robots = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
-        deepest = max(node.depth for node in plan.nodes)
+        carried = Input(bridge.index, Channel.FRAMES)
+        torques = [Input(robot.index, Channel.TORQUE) for robot in plan.robots]
         self.stages = (
-            Stage("report", -3, self._period_ns, (), self._report, self._first_ns),
-            Stage(
-                "serve",
-                2 * deepest + 5,
-                self._period_ns,
-                (Input(bridge.index, Channel.FRAMES), *robots),
-                self._serve,
-                self._first_ns,
-            ),
+            Stage(Turn.REPORT, self._period_ns, (), self._report, self._first_ns),
+            Stage(Turn.SERVE, self._period_ns, (carried, *torques), self._serve, self._first_ns),
         )
 
     def _report(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:

@@ -40,7 +40,7 @@ class BlockGains:
     def of(cls, plan: Plan, block: BlockPlan, lead: float | None = None) -> "BlockGains":
         """Returns the gains of a block of a plan; with `lead` [periods] instead of the plan's, if given."""
         rows = slice(block.offset, block.offset + block.size)
-        node = plan.root if block.node is None else plan.members[block.node]
+        node = plan.root if block.node is None else plan.formation[block.node]
         ahead = (plan.lead if lead is None else lead) * node.period_ns * 1e-9
         K_1, K_2 = block.k1 / block.sigma**2, block.k2 / block.sigma
         unit = np.eye(block.size)

@@ -151,7 +151,8 @@ def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], d
 def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """The bridge of a closed torque path on a wall clock."""
     plan = spec.plan
-    bridge_key = data_key(spec.run, plan.stations[0].path, Channel.WHEELS)
+    assert plan.bridge is not None
+    bridge_key = data_key(spec.run, plan.bridge.path, Channel.WHEELS)
     watch = session.publisher(watch_key(spec.run, "bridge", "bridge")).put if spec.watched else None
     wheels = session.publisher(bridge_key).put
     bridge = _made(lambda: WallBridge(plan, spec.can_urls, Path(spec.folder), wheels, watch))

@@ -140,7 +140,7 @@ class Supervisor:
 
     def _lead_in_s(self) -> float:
         """Returns how long after the barrier run time 0 is on a wall clock: drives are brought up until then."""
-        return max(WALL_START_S, self.plan.can.bring_up_ns / 1e9 if self.plan.stations else 0.0)
+        return max(WALL_START_S, self.plan.can.bring_up_ns / 1e9 if self.plan.can.closed else 0.0)
 
     def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
         """Serves the children until `done`.  Raises RunError if one is lost, the run stalls, or the time is up."""
@@ -260,7 +260,7 @@ class Supervisor:
             return "everyone waits for " + ", ".join(
                 f"{child.name} (process {child.process.pid}, {child.state()})" for child in silent
             )
-        members = self.plan.everyone
+        members = self.plan.all_roles
         waits = [
             f"{child.name} for {', '.join(members[source].name for source in child.waiting_for)}"
             for child in self._children

@@ -13,8 +13,8 @@ def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
     """Returns the numbers of those whose messages are recorded: robots and nodes, then the bridge, then the drives, which say
     something of their own only in virtual time."""
     if not plan.can.closed:
-        return range(len(plan.members) + has_bus)
-    return range(len(plan.everyone) if virtual else len(plan.members) + 1)
+        return range(len(plan.formation) + has_bus)
+    return range(len(plan.all_roles) if virtual else len(plan.formation) + 1)
 
 
 class TimeOrder:

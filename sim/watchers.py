@@ -117,7 +117,7 @@ class RunRecorder:
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self._time_ns = 0
-        self._bridge = len(plan.members)
+        self._bridge = len(plan.formation)
 
     def add(self, messages: Sequence[Message]) -> None:
         """Takes messages in order of time."""

@@ -36,7 +36,7 @@ def ran(plan: Plan, sink: Callable[[Message], None] = lambda message: None) -> E
 
 def stations(engine: Engine) -> tuple[Commander, DriveBank]:
     """Returns the bridge and the drives of a run."""
-    bridge, drives = (engine.roles[station.index] for station in engine.plan.stations)
+    bridge, drives = (engine.roles[station.index] for station in engine.plan.bus_roles)
     assert isinstance(bridge, Commander)
     assert isinstance(drives, DriveBank)
     return bridge, drives
@@ -129,9 +129,7 @@ def test_bring_up_is_over_before_the_run_and_without_torque() -> None:
     for protocol in PROTOCOLS:
         heard = Heard()
         engine = ran(closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", duration=0.1), heard)
-        early = [
-            timed for source, timed in heard.frames if source == engine.plan.stations[0].index and timed.time_ns < 0
-        ]
+        early = [timed for source, timed in heard.frames if source == engine.plan.bridge.index and timed.time_ns < 0]
         assert any(timed.node == BRIDGE_NODE for timed in early)
         assert any(timed.node != BRIDGE_NODE for timed in early)
         assert all(robot.host.enabled for robot in stations(engine)[0].robots)
@@ -142,7 +140,7 @@ def test_bring_up_is_over_before_the_run_and_without_torque() -> None:
 @pytest.mark.parametrize("dead", ["g1/r1", "g2", "coordinator", "bridge"])
 def test_whoever_dies_wheel_torque_is_zero_within_the_watchdog_time_plus_one_frame(protocol: str, dead: str) -> None:
     plan = closed(f"robot.drive.protocol={protocol}", "can.timing=ideal")
-    index = next(one.index for one in plan.everyone if one.name == dead)
+    index = next(one.index for one in plan.all_roles if one.name == dead)
     heard = Heard()
     engine = Engine(plan, heard)
     dies_ns = 1000 * MS

@@ -65,7 +65,7 @@ def test_links_are_one_row_each(run, folder):
     assert len(found) == len(run.plan.links)
     first = run.plan.links[0]
     assert found[0] == {
-        "source": run.plan.members[first.source].name, "receiver": run.plan.members[first.receiver].name,
+        "source": run.plan.formation[first.source].name, "receiver": run.plan.formation[first.receiver].name,
         "channel": first.channel.name.lower(), "sent": "10", "delivered": "7", "lost": "2", "in_flight": "1",
         "used": "9", "held": "3", "age_mean": "0.00250000025", "age_max": "0.006",
     }  # fmt: skip

@@ -13,6 +13,7 @@ from echelon.bridge.stations import rail as on_bus_module
 from echelon.bridge.stations.rail import BusError, Rail, on_bus
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
+from echelon.turns import Turn
 
 NUMBERS = count()
 OF_BRIDGE = [TimedFrame(1000 * at, 0, 0, Frame(0x100 + at, bytes([at] * 8))) for at in range(3)]
@@ -38,7 +39,7 @@ def station(rail: Rail, is_bridge: bool, says: list[TimedFrame], heard: list[Hea
         heard.extend(messages)  # type: ignore[arg-type]
         return (message(says),) if says else ()
 
-    (stage,) = on_bus([Stage("any", 0, 1, (), run)], rail, is_bridge)
+    (stage,) = on_bus([Stage(Turn.HEAR, 1, (), run)], rail, is_bridge)
     return stage
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from echelon.bridge.canlog import read_log
-from echelon.bridge.commander import Commander
 from echelon.bridge.frame import Frame
 from echelon.bridge.plan_dbc import plan_dbc
 from echelon.bridge.protocols import make_drive, make_host, make_observer
@@ -133,8 +132,8 @@ def test_a_host_that_cannot_even_stop_is_made_to_ask_for_no_torque(folder: Path)
     _, plan = load(scenario, ["duration=0.5", "claims=[]"])
     engine = Engine(plan)
     engine.run()
-    commander = engine.roles[plan.stations[0].index]
-    assert isinstance(commander, Commander)
+    commander = engine.commander
+    assert commander is not None
     frames, failure = commander.stop(plan.duration_ns)
     assert [timed.frame for timed in frames] == [Frame(0x300 + robot, bytes(5)) for robot in range(3)]
     assert failure == "my_drive.py:MyProtocol of r1: its host's stop raised RuntimeError: no"

@@ -56,7 +56,7 @@ def run(protocol: str, *overrides: str) -> tuple[Plan, tuple[Heard, ...]]:
     carried: list[Heard] = []
 
     def take(message: Message) -> None:
-        if message.channel is Channel.FRAMES and message.source == plan.stations[0].index:
+        if message.channel is Channel.FRAMES and message.source == plan.bridge.index:
             carried.extend((timed.time_ns, timed.bus, timed.frame) for timed in unpack(message.values))
 
     Engine(plan, take).run()

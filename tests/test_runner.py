@@ -170,7 +170,7 @@ def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: i
     network = Network()
     runners = [
         Runner(make_role(plan, one.index), plan, network.session(one.name), RUN, watched=True, virtual=True)
-        for one in plan.members
+        for one in plan.formation
     ]
     ended: list[int] = []
 
@@ -430,5 +430,5 @@ def test_keys_of_what_a_member_hears() -> None:
         subscribe=lambda keys, receive: heard.extend(keys), publisher=lambda key: SimpleNamespace(put=lambda data: None)
     )
     Runner(make_role(plan, plan.nodes[1].index), plan, session, RUN, watched=False, virtual=True)
-    g1 = [data_key(RUN, plan.members[child].path, Channel.STATE) for child in plan.nodes[1].children]
+    g1 = [data_key(RUN, plan.formation[child].path, Channel.STATE) for child in plan.nodes[1].children]
     assert heard == sorted([*g1, data_key(RUN, "", Channel.REFERENCE)])

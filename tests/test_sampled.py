@@ -14,7 +14,9 @@ from trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_ran
 
 from echelon.controller.law import BlockGains, CentralLaw
 from echelon.controller.sampled import delay_margin, error_map, largest_stable_delay, spectral_radius, tick_gains
+from echelon.controller.trajectory import Line
 from echelon.plan import Array, Plan
+from echelon.plugins import Part
 from echelon.sim.parts import load
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=30)
@@ -40,8 +42,8 @@ def random_plan(tree, seed: int, T: float) -> Plan:
 def run(plan: Plan, delay_ticks: int, ticks: int) -> Array:
     """Returns |(e, T ė)| tick by tick of points that do exactly what the central law tells them, from old states."""
     T = plan.root.period_ns * 1e-9
-    central, random = CentralLaw(replace(plan, trajectory=replace(plan.trajectory, kind="line", parameters={
-        "start": (0.0, 0.0), "velocity": (0.0, 0.0)}))), np.random.default_rng(1)  # fmt: skip
+    rest = Part("line", {}, None, Line(velocity=(0.0, 0.0)))
+    central, random = CentralLaw(replace(plan, trajectory=rest)), np.random.default_rng(1)
     x = central.transformation.backward(central.transformation.desired(np.zeros(2)))
     x, v = x + random.normal(size=x.shape), np.zeros_like(x)
     known: deque[tuple[Array, Array]] = deque([(x, v)] * (delay_ticks + 1), maxlen=delay_ticks + 1)

@@ -234,7 +234,7 @@ def test_torques_are_measured_over_the_periods(run):
 
 def test_links_and_what_is_passed_in_are_fit_for_json(run, summary):
     first, second = summary["links"][:2]
-    assert first["source"] == run.plan.members[run.plan.links[0].source].name
+    assert first["source"] == run.plan.formation[run.plan.links[0].source].name
     assert first["sent"] == first["delivered"] + first["lost"] + first["in_flight"]
     assert (first["age_mean"], first["age_max"]) == (0.00250000025, 0.006)
     assert second["held"] == 0

@@ -44,7 +44,7 @@ class MirrorBridge(Bridge):
         self._log = CanLog(folder / "can.log", plan.can.buses[0].name, 0)
         self._bus_of = [robot.drive.bus for robot in plan.robots]
         self._names = [bus.name for bus in plan.can.buses]
-        self._source = len(plan.members)
+        self._source = len(plan.formation)
         self._sequence = 0
         self._time_ns = 0
 

@@ -59,7 +59,8 @@ class WallBridge(Bridge):
             PacedBus(bus, model, plan.can.watchdog_ns)
             for bus, model in zip(self._closed.buses, self._role.buses, strict=True)
         ]
-        self._period_ns = plan.stations[0].period_ns
+        assert plan.bridge is not None
+        self._period_ns = plan.bridge.period_ns
         self._last: list[Message | None] = [None] * len(plan.robots)
         self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period that a robot's torque was last sent in
         self._cycle = -plan.can.bring_up_ns // self._period_ns
@@ -67,11 +68,11 @@ class WallBridge(Bridge):
         self._frames: list[TimedFrame] = []
         self._bits = [BitCount() for _ in plan.can.buses]
         self._logged_ns = -1 << 62
-        everyone = plan.everyone
+        all_roles = plan.all_roles
         self._links = [
-            Link(link, plan.seed, everyone[link.source].name, everyone[link.receiver].name)
+            Link(link, plan.seed, all_roles[link.source].name, all_roles[link.receiver].name)
             for link in plan.links
-            if link.channel is Channel.TORQUE and link.receiver == plan.stations[0].index
+            if link.channel is Channel.TORQUE and link.receiver == plan.bridge.index
         ]
         self._flying: list[tuple[int, int, int, Message]] = []
         self.link_lost = 0

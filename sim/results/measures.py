@@ -188,7 +188,7 @@ def _finite(value: SupportsFloat) -> float | None:
 
 def link_result(plan: Plan, counts: LinkCounts) -> LinkResult:
     """Returns one link's counts with its members' names: a row of `links.csv`."""
-    members = plan.everyone
+    members = plan.all_roles
     return LinkResult(
         source=members[counts.source].name,
         receiver=members[counts.receiver].name,

@@ -13,13 +13,15 @@ For notebooks and scripts:
     echelon.open_run("runs/demo")           a run from its folder
     echelon.Simulation("lab")               a run step by step
 
-For your own parts (docs/add-a-law.md): `Law`, `Plant`, `Trajectory`.  The command line is `echelon --help`.
+For parts of your own: `Plant`, `Trajectory`, `DriveProtocol` (docs/add-a-law.md, docs/add-a-protocol.md).
+The command line is `echelon --help`.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from echelon.agents.plant import Plant
+    from echelon.bridge.protocol import DriveProtocol
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.notebook import Loaded, load, open_run, run
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "DriveProtocol",
     "Loaded",
     "Plant",
     "Run",
@@ -65,6 +68,10 @@ def __getattr__(name: str) -> Any:
             from echelon.controller.trajectory import Trajectory
 
             found = {"Trajectory": Trajectory}
+        case "DriveProtocol":
+            from echelon.bridge.protocol import DriveProtocol
+
+            found = {"DriveProtocol": DriveProtocol}
         case "UserError":
             from echelon.errors import UserError
 

@@ -23,9 +23,11 @@ from echelon.bridge.stations.closed import LOG
 from echelon.loading import effective_toml
 from echelon.messages import Message
 from echelon.plan import Plan
+from echelon.plugins import PartRunError
 from echelon.scenario import Scenario
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display
+from echelon.sim.parts import write_files
 from echelon.sim.results.records import ProcessResult, RunFacts, Summary
 from echelon.sim.results.rendering import write_summary
 from echelon.sim.results.summary import summarise
@@ -74,6 +76,7 @@ def execute(
     begun = datetime.now(UTC)
     toml = effective_toml(scenario)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
+    write_files(plan, folder)
     metadata = {
         "scenario": scenario.name,
         "engine": engine,
@@ -97,7 +100,10 @@ def execute(
         ).run()
     can = outcome.can
     if can is not None and can.referee is None:
-        can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not outcome.failure))
+        try:
+            can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not outcome.failure))
+        except PartRunError as error:
+            outcome.failure = outcome.failure or str(error)
     display.close()
     summary = summarise(outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun))
     write_summary(summary, folder / "summary.json")
@@ -153,18 +159,23 @@ def _in_process(
             if recording.recorder.failure:
                 failure = f"the recording failed: {recording.recorder.failure}"
                 break
+    except PartRunError as error:
+        failure = str(error)
     except KeyboardInterrupt:
         failure = "interrupted"
         bridge.interrupt()
     wall_s = time.monotonic() - begun_s
     try:
         pass_on()
-    except SystemExit:
+    except (SystemExit, PartRunError):
         pass
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
-    bridge.stop()
+    try:
+        bridge.stop()
+    except PartRunError as error:
+        failure = failure or str(error)
     bridge.close()
     recorded = recording.report()
     failure = failure or (f"the recording failed: {recorded.failure}" if recorded.failure else None)

@@ -144,6 +144,8 @@ def _one_of(allowed: Sequence[str], value: Any = None) -> str:
 def _unknown(key: str, model: Any) -> str:
     known = sorted(_bare(model).model_fields)
     close = get_close_matches(key, known, n=1, cutoff=0.5)
+    if not known:
+        return "unknown key; there are none here"
     return f"unknown key; did you mean {close[0]!r}?" if close else f"unknown key; known here: {', '.join(known)}"
 
 

@@ -4,6 +4,7 @@
     trajectory = { use = "my_paths.py:Spiral", parameters = { rate = 0.2 } }         the same for any part
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
+    law = { use = "my_laws.py:Relay", parameters = { gain = 2.0 }, epsilon = [0.5] }   beside keys of the table itself
 
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
@@ -19,6 +20,7 @@ from echelon.plugins import Part, Registry
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
+_NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.load)"
 _SCHEMA: Final[dict[str, Any]] = {
     "type": "object",
     "properties": {"use": {"type": "string"}, _PARAMETERS: {"type": "object"}},
@@ -37,7 +39,7 @@ class PartContext(NamedTuple):
 def make_part(group: str, use: Any, parameters: Any, context: PartContext | None) -> Part[Any]:
     """Returns the part that a scenario describes.  Raises PartError, whose keys are `use` or `parameters`."""
     if context is None:
-        raise TypeError("a scenario with parts is validated with a PartContext (echelon.sim.parts.load)")
+        raise TypeError(_NO_CONTEXT)
     if not isinstance(parameters, Mapping):
         raise PartError("must be a table", (_PARAMETERS,), parameters)
     if not isinstance(use, str):
@@ -115,6 +117,40 @@ def _written_by_name(part: Part[Any] | None) -> Any:
     return {"use": part.use, _PARAMETERS: dict(part.parameters)}
 
 
+def _named(group: str) -> Callable[[Any, ValidationInfo], str]:
+    """Returns the validator of a name whose parameters stand in the field `parameters` beside it."""
+
+    def validate(value: Any, info: ValidationInfo) -> str:
+        context: PartContext | None = info.context
+        if context is None:
+            raise TypeError(_NO_CONTEXT)
+        if not isinstance(value, str):
+            raise PartError(context.registry.allowed(group), (), value)
+        try:
+            context.registry.groups[group].find(value, context.folder)
+        except PartError as mistake:
+            raise mistake.at(shown=value) from None
+        return value
+
+    return validate
+
+
+def _beside_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
+    """Returns the validator of the parameters of a part whose name stands in the field `use` before them."""
+
+    def validate(value: Any, info: ValidationInfo) -> Part[Any] | None:
+        if isinstance(value, Part):
+            return value
+        if "use" not in info.data:  # what is wrong there is said already
+            return None
+        try:
+            return make_part(group, info.data["use"], value, info.context)
+        except PartError as mistake:
+            raise _beside(mistake) from None
+
+    return validate
+
+
 TrajectoryField = Annotated[
     Part[Any], PlainValidator(_inline("trajectories")), PlainSerializer(_written_inline), WithJsonSchema(_SCHEMA)
 ]
@@ -123,4 +159,11 @@ PlantField = Annotated[
     PlainValidator(_by_name("plants")),
     PlainSerializer(_written_by_name),
     WithJsonSchema({"anyOf": [{"type": "string"}, _SCHEMA]}),
+]
+LawName = Annotated[str, PlainValidator(_named("laws")), WithJsonSchema({"type": "string"})]
+LawParameters = Annotated[
+    Part[Any],
+    PlainValidator(_beside_name("laws")),
+    PlainSerializer(lambda part: dict(part.parameters)),
+    WithJsonSchema({"type": "object"}),
 ]

@@ -27,7 +27,7 @@ from echelon.plan import (
     RobotPlan,
 )
 from echelon.plugins import Registry
-from echelon.scenario import LinkRule, Scenario, Uniform
+from echelon.scenario import Law, LinkRule, Scenario, Uniform
 from echelon.values import path_matches
 
 MAX_DELAY: Final = 1e6
@@ -47,6 +47,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         raise PlanError(f"duration = {scenario.duration}: must be a multiple of {period}, the coordinator's period")
     display_ns = nanoseconds(scenario.record.display_period, "record.display_period")
     blocks = make_blocks(scenario.law, nodes)
+    _check_law(scenario.law)
     for at, claim in enumerate(scenario.claims):
         fitting(blocks, claim.block, f"claims.{at}.block")
     plan = Plan(
@@ -57,6 +58,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         robots=robots,
         nodes=nodes,
         blocks=blocks,
+        law=scenario.law.parameters,
         coupling=make_coupling(scenario.law, blocks),
         lead=scenario.law.lead,
         trajectory=scenario.trajectory,
@@ -68,6 +70,14 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         stations=stations,
     )
     return sized(plan)
+
+
+def _check_law(law: Law) -> None:
+    """Refuses keys that the law makes no use of."""
+    for key, value, unset in (("gains", law.gains, []), ("lead", law.lead, 0.0)):
+        if value != unset and key not in law.parameters.made.uses:
+            what = "has gains of its own, in law.parameters" if key == "gains" else "does not look ahead"
+            raise PlanError(f"law.{key}: the law {law.use!r} {what}; leave {key} out")
 
 
 def _stations(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[StationPlan, ...]:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
-from echelon.part_fields import PlantField, TrajectoryField
+from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField
 from echelon.values import (
     CouplingGain,
     Finite,
@@ -149,16 +149,20 @@ class Coupling(Table):
 class Law(Table):
     """The control law (theory.md section 3)."""
 
+    use: LawName = Field(default="linear", validate_default=True)
+    """`linear`, `integral`, `terminal_sliding` (controller.laws), or another (docs/add-a-law.md)"""
+    parameters: LawParameters = Field(default_factory=dict, validate_default=True)
+    """Those of the law that `use` names"""
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
     epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
     """ε1, ε2, …: each block's σ is a product of the first ones"""
     gains: list[Gains] = []
-    """Later entries override earlier ones"""
+    """K_1 and K_2 of each block, for laws that use them; later entries override earlier ones"""
     coupling: list[Coupling] = []
     """Later entries override earlier ones; none means no coupling"""
     lead: Fraction = 0.0
-    """How far ahead the law looks, in periods: 0 is the paper's law as it stands, 0.5 makes up for the hold"""
+    """How far ahead the law looks, in periods, for laws that do: 0 is the law as it stands, 0.5 makes up for the hold"""
 
 
 class Avoidance(Table):
@@ -251,7 +255,7 @@ class Scenario(Table):
     """The root of the tree"""
     trajectory: TrajectoryField
     """Of the centroid: `line`, `circle`, `sine` or `waypoints` with their parameters (controller.trajectory), or another"""
-    law: Law = Law()
+    law: Law = Field(default_factory=dict, validate_default=True)
     avoidance: Avoidance = Avoidance()
     links: list[LinkRule] = []
     can: Can = Can()

@@ -143,8 +143,7 @@ def doctor(arguments: argparse.Namespace) -> int:
 
 def analyse(arguments: argparse.Namespace) -> int:
     """`echelon analyse`"""
-    from echelon.controller.law import BlockGains
-    from echelon.controller.sampled import delay_margin, largest_stable_delay, spectral_radius
+    from echelon.controller.sampled import delay_margin, largest_stable_delay, linear_gains, spectral_radius
 
     _, plan = scenario_of(arguments)
     period_s = plan.root.period_ns / 1e9
@@ -156,8 +155,8 @@ def analyse(arguments: argparse.Namespace) -> int:
     margins = {}
     for block in plan.blocks:
         if block.size:
-            gains = BlockGains.of(plan, block, 0.0)
-            margin = delay_margin(float(gains.K_1[0, 0]), float(gains.K_2[0, 0]))
+            gains = linear_gains(plan, block, 0.0)
+            margin = delay_margin(*(float(matrix[0, 0]) for matrix in (gains.K_1, gains.K_2, gains.K_i)))
             margins[block.name] = {"sigma": block.sigma, "delay_margin": margin}
     if arguments.json:
         facts = {

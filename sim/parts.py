@@ -6,6 +6,7 @@ from typing import Final
 
 import echelon.load
 from echelon.agents.plant import PLANTS, Plant
+from echelon.controller.laws import LAWS, Law
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
 from echelon.plan import Plan
 from echelon.plugins import Group, Registry
@@ -13,6 +14,7 @@ from echelon.scenario import Scenario
 
 REGISTRY: Final = Registry(
     {
+        "laws": Group("laws", Law, LAWS),
         "plants": Group("plants", Plant, PLANTS),
         "trajectories": Group("trajectories", Trajectory, TRAJECTORIES),
     }

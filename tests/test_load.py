@@ -3,6 +3,7 @@
 import copy
 import math
 import string
+from contextlib import suppress
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -398,7 +399,9 @@ def mutated(draw: st.DrawFn) -> str:
             case "insert" if isinstance(at, dict):
                 at[draw(keys)] = draw(values)
             case "nudge":
-                at[last] *= draw(st.sampled_from([-1, 0, 2, 10, 1e-3, 1e9, 1e300]))
+                factor = draw(st.sampled_from([-1, 0, 2, 10, 1e-3, 1e9, 1e300]))
+                with suppress(OverflowError):  # of an integer that no float can hold
+                    at[last] *= factor
             case _:
                 at[last] = draw(values)
     return tomlkit.dumps(table)

@@ -10,7 +10,8 @@ from trees import PAPER_TREE, Tree, plan_of, random_epsilon, scenario, trees, wi
 
 from echelon.agents.plant import state_at
 from echelon.agents.robot import Robot
-from echelon.controller.law import BlockGains, CentralLaw
+from echelon.controller.laws.central import CentralLaw
+from echelon.controller.laws.in_tree import BlockGains
 from echelon.layout import sized
 from echelon.messages import NULL, STATE_FIELDS, Channel, Message
 from echelon.plan import Array, AvoidancePlan, LinkPlan, Plan
@@ -178,7 +179,7 @@ def test_slow_coordinator_holds_what_it_said(ratio, coupling):
         for block, gain in zip(plan.blocks, gains, strict=True):
             rows = slice(block.offset, block.offset + block.size)
             e, e_dot, _ = now if rows.stop <= intra.stop else last
-            nu[rows] = gain.nu(e[rows], e_dot[rows]) - gain.K_coupling @ last[1]
+            nu[rows] = -gain.K_1 @ e[rows] - gain.K_2 @ e_dot[rows] - gain.K_coupling @ last[1]
         nu[-2:] += last[2]
         expected = cbt.backward(nu.reshape(-1, 2))
         np.testing.assert_allclose(run.commanded(time_ns), expected, atol=1e-12 * (1 + np.abs(expected).max()))

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from scipy.signal import cont2discrete
 from synthetic import PAPER
 from trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_random_gains
 
-from echelon.controller.law import BlockGains, CentralLaw
+from echelon.controller.laws.central import CentralLaw
+from echelon.controller.laws.in_tree import BlockGains
 from echelon.controller.sampled import delay_margin, error_map, largest_stable_delay, spectral_radius, tick_gains
 from echelon.plan import Array, Plan
-from echelon.sim.parts import load
+from echelon.sim.parts import REGISTRY, load
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=30)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,8 +42,8 @@ def random_plan(tree, seed: int, T: float) -> Plan:
 def run(plan: Plan, delay_ticks: int, ticks: int) -> Array:
     """Returns |(e, T ė)| tick by tick of points that do exactly what the central law tells them, from old states."""
     T = plan.root.period_ns * 1e-9
-    central, random = CentralLaw(replace(plan, trajectory=replace(plan.trajectory, kind="line", parameters={
-        "start": (0.0, 0.0), "velocity": (0.0, 0.0)}))), np.random.default_rng(1)  # fmt: skip
+    rest = REGISTRY.make("trajectories", "line", {"velocity": (0.0, 0.0)}, Path())
+    central, random = CentralLaw(replace(plan, trajectory=rest)), np.random.default_rng(1)
     x = central.transformation.backward(central.transformation.desired(np.zeros(2)))
     x, v = x + random.normal(size=x.shape), np.zeros_like(x)
     known: deque[tuple[Array, Array]] = deque([(x, v)] * (delay_ticks + 1), maxlen=delay_ticks + 1)

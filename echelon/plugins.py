@@ -23,7 +23,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from echelon.explain import PartError
+from echelon.explain import PartError, one_line
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -38,7 +38,10 @@ class Plugin(BaseModel):
 
 
 class PartRunError(Exception):
-    """A part that others wrote failed in a run; the text names its file and class, and what it did."""
+    """A part that others wrote failed in a run; the text is one line that names its file and class, and what it did."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,11 +109,12 @@ def test_the_base_is_right():
         # One of several
         (
             ("mass = 10.0", "model = 'rigid'"),
-            "robot.model = 'rigid': must be one of 'paper', 'rigid_body', or 'file.py:Class'; did you mean 'rigid_body'?",
+            "robot.model = 'rigid': must be one of 'paper', 'rigid_body', 'hill', or 'file.py:Class'; did you mean "
+            "'rigid_body'?",
         ),
         (
             ("mass = 10.0", "model = [1]"),
-            "robot.model = [1]: must be one of 'paper', 'rigid_body', or 'file.py:Class'",
+            "robot.model = [1]: must be one of 'paper', 'rigid_body', 'hill', or 'file.py:Class'",
         ),
         (
             ('kind = "circle"', 'kind = "circel"'),

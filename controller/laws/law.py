@@ -159,11 +159,14 @@ def _checked(nu: Nu, size: int, who: str) -> Nu:
     def checked(t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
         lost = not all(np.abs(given).max() < _HUGE for given in (e, e_dot, feed_forward))
         try:
-            answer = np.asarray(nu(t, e, e_dot, feed_forward, state), dtype=np.float64)
+            given = nu(t, e, e_dot, feed_forward, state)
+            answer = np.asarray(given, dtype=np.float64)
         except Exception as error:
             if lost:
                 return np.full(size, np.nan)
             raise PartRunError(f"{who}: nu at t = {t:g} s raised {type(error).__name__}: {error}") from error
+        if given is None:
+            raise PartRunError(f"{who}: nu at t = {t:g} s returned nothing; it must return {size} numbers")
         if answer.shape != (size,):
             raise PartRunError(f"{who}: nu at t = {t:g} s has the shape {answer.shape}, not ({size},)")
         if not lost and not np.isfinite(answer).all():

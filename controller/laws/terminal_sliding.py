@@ -16,10 +16,18 @@ linear law: the error of a block with σ at time t is that of one with σ = 1 s 
 2. At (c^γ e, c e') instead of (e, e'), c > 0, (e', e'') is (c e', c^(2-γ) e''): the motion is homogeneous of degree 1 - γ < 0.
 3. Asymptotically stable and homogeneous of negative degree is finite-time stable (Bhat, Bernstein 2005, Theorem 7.1).
 
-*How long it takes.*  On the surface from e_0: σ γ/(γ-1) β^(-1/γ) |e_0|^(1-1/γ).  From rest it is in the same proportion to
-|e_0|^(1-1/γ), by 2.; with γ = 1.5, β = κ = 1 it is 3.6 σ from 1 m.
+*What κ must be.*  With ρ = 2/γ - 1, and
 
-*What a constant acceleration w leaves*, such as a slope: |e| = (σ² |w|/κ)^(γ/(2-γ)), for it comes to rest at e' = 0, s = e.
+    κ > ρ^ρ (1-ρ)^(1-ρ) β^(2/γ)/γ
+
+the surface is reached before zero is.  Below that there are curves e' = -c e^(1/γ) above the surface (put it into e'') which
+motions follow to zero, more slowly; such a κ is refused.
+
+*How long it takes.*  On the surface from e_0: σ γ/(γ-1) β^(-1/γ) |e_0|^(1-1/γ).  From rest it is in the same proportion to
+|e_0|^(1-1/γ), by 2.; with γ = 1.5, β = κ = 1 it is 3.7 σ from 1 m.
+
+*What a constant acceleration w leaves*, such as a slope's, without look-ahead: |e| = (σ² |w|/κ)^(γ/(2-γ)), where ν and w
+cancel; the error creeps there.
 
 *Sampled.*  ν is held for T.  Its slope has no bound near zero, so it overshoots there: what remains is e = 0 at the ticks, with
 e' = ±a from tick to tick and ν - Z̈_bd = ∓2 a/(T σ),
@@ -36,10 +44,10 @@ There is one such η, for f falls in both arguments.  With λ = 1 nothing remain
 
 from collections.abc import Callable
 from math import copysign
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, ClassVar, Final, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from echelon.controller.laws.law import Block, Law, Nu
 from echelon.plan import Array
@@ -62,6 +70,16 @@ class TerminalSliding(Law):
     """β, how fast the surface leads to zero"""
     kappa: Positive = 1.0
     """κ, how hard the error is pulled towards the surface"""
+
+    @model_validator(mode="after")
+    def _reaches(self) -> Self:
+        rho = 2 / self.gamma - 1
+        least = rho**rho * (1 - rho) ** (1 - rho) * self.beta ** (2 / self.gamma) / self.gamma
+        if self.kappa <= least:
+            raise ValueError(
+                f"kappa = {self.kappa:g} must be greater than {least:.4g} with this gamma and beta: else no surface is reached"
+            )
+        return self
 
     def nu(self, block: Block, t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
         """Returns ν [m/s²], (size,)."""

@@ -12,9 +12,11 @@ import numpy as np
 
 from echelon.agents.plant import LOST, make_step, state_at
 from echelon.agents.torque import TorqueLimits, make_inverse
+from echelon.layout import acceleration_of
 from echelon.messages import Channel, Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 
 class Robot:
@@ -34,13 +36,12 @@ class Robot:
         )
         self._inner = robot.period_ns // robot.torque_period_ns
         self._h = robot.torque_period_ns * 1e-9
-        self._at = 2 * robot.child_number
+        self._mine = acceleration_of(robot)
         self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
         self._did = (0.0,) * 9
-        deepest = max(node.depth for node in plan.nodes)
         self.stages: tuple[Stage, ...] = (
-            Stage("say", 0, robot.period_ns, (), self._say),
-            Stage("move", 2 * deepest + 3, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
+            Stage(Turn.SAY, robot.period_ns, (), self._say),
+            Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
         )
 
     def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
@@ -56,7 +57,7 @@ class Robot:
         if command is None:
             ax = ay = 0.0
         else:
-            ax, ay = command.values[self._at : self._at + 2].tolist()
+            ax, ay = command.values[self._mine].tolist()
         try:
             self._advance(ax, ay, command is not None)
         except (ValueError, OverflowError):  # the run diverged: angles and speeds beyond what floats can hold
@@ -103,16 +104,15 @@ class RobotOnBus(Robot):
         self._torques: list[tuple[float, float]] = []
         self._limited_count = 0
         self._heard = (0.0, 0.0)
-        deepest = max(node.depth for node in plan.nodes)
-        bridge = plan.stations[0].index
+        assert plan.bridge is not None
         h_ns = robot.torque_period_ns
         self.stages = (
-            Stage("move", -1, h_ns, (Input(bridge, Channel.WHEELS),), self._turn),
-            Stage("say", 0, robot.period_ns, (), self._say),
-            Stage("want", 2 * deepest + 3, h_ns, (Input(robot.parent, Channel.COMMAND),), self._want),
+            Stage(Turn.CATCH_UP, h_ns, (Input(plan.bridge.index, Channel.WHEELS),), self._catch_up),
+            Stage(Turn.SAY, robot.period_ns, (), self._say),
+            Stage(Turn.ACT, h_ns, (Input(robot.parent, Channel.COMMAND),), self._want),
         )
 
-    def _turn(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+    def _catch_up(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Moves through the torque period that ends at `time_ns`."""
         if time_ns == 0:
             return ()
@@ -154,7 +154,7 @@ class RobotOnBus(Robot):
             self._heard = (0.0, 0.0)
             self._limits.tau_right = self._limits.tau_left = 0.0
         else:
-            ax, ay = self._heard = command.values[self._at : self._at + 2].tolist()
+            ax, ay = self._heard = command.values[self._mine].tolist()
             try:
                 right, left = self._inverse(state, ax, ay, 0.5 * self._h)
             except (ValueError, OverflowError):

@@ -22,7 +22,7 @@ import numpy as np
 from bench.product import Row, table
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import resolve_url
-from echelon.bridge.commander import Torques
+from echelon.bridge.commander import RobotChannel
 from echelon.bridge.frame import Frame
 from echelon.bridge.protocols import drive_places, make_drive
 from echelon.load import effective_toml
@@ -51,9 +51,10 @@ class Robots:
 
     def __init__(self) -> None:
         plan = lab()[1]
-        self.period_ns = plan.stations[0].period_ns
+        assert plan.bridge is not None
+        self.period_ns = plan.bridge.period_ns
         self.robots = [
-            Torques(replace(robot, drive=replace(robot.drive, watchdog_ns=NEVER_NS))) for robot in plan.robots
+            RobotChannel(replace(robot, drive=replace(robot.drive, watchdog_ns=NEVER_NS))) for robot in plan.robots
         ]
         self.cycle = 0
         drives = [make_drive(plan, place) for place in drive_places(plan)]

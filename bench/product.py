@@ -47,7 +47,7 @@ def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float
         raise RuntimeError(outcome.failure)
     ticks = plan.duration_ns / plan.robots[0].period_ns
     robots = {robot.name for robot in plan.robots}
-    memory = max(result.resident_bytes for result in outcome.results if result.name in robots)
+    memory = max(result.resident_bytes for result in outcome.processes if result.name in robots)
     return ticks / outcome.wall_s, outcome.startup_s, memory / 1e6
 
 
@@ -68,7 +68,7 @@ def lab_in_process(*, whole: bool) -> float:
                 can_urls=("virtual",),
                 display=display,
             )
-        return float(done.summary["run"]["real_time_factor"])
+        return float(done.summary.run.real_time_factor or 0.0)
     engine = Engine(plan)
     begun_s = time.perf_counter()
     engine.run()

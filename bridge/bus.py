@@ -27,6 +27,9 @@ _STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)
 _TRIES = 10
 _AT_ONCE = int(socket.MSG_DONTWAIT)
 _PAUSE = 0.0005  # [s]; with _TRIES, one full queue holds the caller up for 5 ms at most
+_SKEW_NS = 1_000_000
+"""A frame that is stamped by less than this before the frame in front of it came after it all the same: processors stamp
+frames of several senders side by side, some microseconds before they put them into one queue."""
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
 
 
@@ -94,7 +97,7 @@ def _wire(bus: can.BusABC, address: Address) -> Wire | None:
 class Bus:
     """A bus to send frames on. Trouble on it is survived and counted in `counts`, the last error kept in `error`."""
 
-    __slots__ = ("_bus", "_message", "_sleep", "_tries", "_wire", "counts", "error", "url")
+    __slots__ = ("_bus", "_last_ns", "_message", "_sleep", "_tries", "_wire", "counts", "error", "url")
 
     def __init__(
         self,
@@ -110,6 +113,7 @@ class Bus:
         self._sleep = sleep
         self._tries = _TRIES
         self._message = can.Message(is_extended_id=False)
+        self._last_ns = 0  # the stamp of the last frame
         self._wire = wire  # None: python-can itself sends and receives
 
     @property
@@ -226,8 +230,12 @@ class Bus:
                 continue
             can_id, data, remote = frame
             seconds, nanoseconds = _STAMP.unpack(stamps[0][2]) if stamps else (0, time.time_ns())
+            time_ns = seconds * 1_000_000_000 + nanoseconds
+            if 0 < self._last_ns - time_ns < _SKEW_NS:
+                time_ns = self._last_ns
+            self._last_ns = time_ns
             self.counts.received += 1
-            return Received(can_id, data, seconds * 1_000_000_000 + nanoseconds, remote)
+            return Received(can_id, data, time_ns, remote)
 
     def _recv_failed(self, error: Exception) -> None:
         self.error = error

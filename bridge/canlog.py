@@ -9,7 +9,6 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -142,12 +141,3 @@ def read_log(path: Path) -> Iterator[Logged]:
                 time_ns = int(seconds) * 1_000_000_000 + int(micros) * 1000
                 frame = Frame(int(identifier, 16) & 0x7FF, bytes.fromhex(data or ""), remote is not None)
                 yield Logged(time_ns, channel, frame)
-
-
-def read_frames(path: Path, count: int) -> list[tuple[int, int, bytes]]:
-    """Returns the first `count` data frames of a log as (time [ns], identifier, data); none if there is no log."""
-    try:
-        frames = (logged for logged in read_log(path) if not logged.frame.remote)
-        return [(logged.time_ns, logged.frame.can_id, logged.frame.data) for logged in islice(frames, count)]
-    except OSError:
-        return []

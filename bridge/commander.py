@@ -10,7 +10,7 @@ Feedback is a sample of its instant: the plant, which is not on the bus, takes i
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -25,10 +25,12 @@ from echelon.bridge.frame import Frame, Host
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
 from echelon.bridge.ideal_bus import IdealBus
 from echelon.bridge.protocols import drive_places, make_host
+from echelon.bridge.reports import WheelsReport
 from echelon.bridge.schedule import Schedule
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 _COMMANDED: Final = TORQUE_FIELDS.index("commanded")
 _SATURATED: Final = TORQUE_FIELDS.index("saturated")
@@ -41,7 +43,7 @@ def _fresh(message: Heard, time_ns: int) -> list[TimedFrame]:
     return [] if message is None or message.time_ns != time_ns else unpack(message.values)
 
 
-class Torques:
+class RobotChannel:
     """The way of one robot's torques to its drives: envelope, then host; counts what it stopped, and why."""
 
     def __init__(self, robot: RobotPlan) -> None:
@@ -92,17 +94,17 @@ class Torques:
             return 0.0, 0.0
         return self.host.torque
 
-    def summary(self) -> dict[str, Any]:
+    def report(self) -> WheelsReport:
         """Returns the counts."""
-        return {
-            "protocol": self.robot.drive.protocol,
-            "commands": self.commands,
-            "stopped": dict(sorted(self.stopped.items())),
-            "refused": dict(sorted(self.host.refused.items())),
-            "largest": self.largest,
-            "enabled": self.host.enabled,
-            "fault": self.host.fault,
-        }
+        return WheelsReport(
+            protocol=self.robot.drive.protocol,
+            commands=self.commands,
+            stopped=dict(sorted(self.stopped.items())),
+            largest=self.largest,
+            refused=dict(sorted(self.host.refused.items())),
+            enabled=self.host.enabled,
+            fault=self.host.fault,
+        )
 
 
 class Commander:
@@ -111,13 +113,14 @@ class Commander:
     Its models of the buses have the drives' controllers in them too, unless `alone`."""
 
     def __init__(self, plan: Plan, *, alone: bool = False) -> None:
-        bridge = plan.stations[0]
+        bridge = plan.bridge
+        assert bridge is not None
         self.index = bridge.index
         self._first_ns = bridge.first_ns
         self._period_ns = bridge.period_ns
         self.next_ns = bridge.first_ns
         """End of the last period that frames were made for"""
-        self.robots = [Torques(robot) for robot in plan.robots]
+        self.robots = [RobotChannel(robot) for robot in plan.robots]
         self.buses: list[BusTime | IdealBus] = make_buses(plan)
         self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
         for robot in self.robots:
@@ -138,12 +141,11 @@ class Commander:
         """How many events of each bus drives have been told of"""
         self.refused: Counter[str] = Counter()
         """What came as messages and cannot be"""
-        deepest = max(node.depth for node in plan.nodes)
-        heard = tuple(Input(station.index, Channel.FRAMES) for station in plan.stations[1:])
+        reports = () if plan.drives is None else (Input(plan.drives.index, Channel.FRAMES),)
         torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
         self.stages = (
-            Stage("hear", -2, self._period_ns, heard, self._hear, self._first_ns),
-            Stage("send", 2 * deepest + 4, self._period_ns, torques, self._send, self._first_ns),
+            Stage(Turn.HEAR, self._period_ns, reports, self._hear, self._first_ns),
+            Stage(Turn.SEND, self._period_ns, torques, self._send, self._first_ns),
         )
 
     def _hear(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
@@ -243,6 +245,6 @@ class Commander:
         self._disturbances.apply(time_ns)
         return frames
 
-    def summary(self) -> dict[str, Any]:
-        """Returns what the bridge saw of every robot."""
-        return {robot.robot.name: robot.summary() for robot in self.robots}
+    def reports(self) -> dict[str, WheelsReport]:
+        """Returns the reports of all robots, by name."""
+        return {robot.robot.name: robot.report() for robot in self.robots}

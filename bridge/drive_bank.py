@@ -7,18 +7,20 @@ turn as the robots say; the torque that reaches a robot is what its drives repor
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
-from echelon.bridge.buses import lost_row
+from echelon.bridge.buses import lost_report
 from echelon.bridge.frame import Drive, Frame
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
 from echelon.bridge.motor import Fault
 from echelon.bridge.protocols import DrivePlace, drive_places, make_drive
+from echelon.bridge.reports import DriveReport, DrivesReport
 from echelon.bridge.schedule import Schedule
 from echelon.can_plan import NEVER_NS
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 _SPEED = TORQUE_FIELDS.index("speed_right")
 FASTEST: Final = 1e6
@@ -55,7 +57,9 @@ class DriveBank:
     """All virtual drives of a plan, on all its buses."""
 
     def __init__(self, plan: Plan) -> None:
-        bridge, drives = plan.stations
+        bridge, drives = plan.bridge, plan.drives
+        assert bridge is not None
+        assert drives is not None
         self.index = drives.index
         self._first_ns = drives.first_ns
         self._plan = plan
@@ -75,18 +79,11 @@ class DriveBank:
         self._of_robot: list[list[PlacedDrive]] = [[] for _ in plan.robots]
         for placed in self.drives:
             self._of_robot[placed.place.robot].append(placed)
-        robots = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
-        deepest = max(node.depth for node in plan.nodes)
+        carried = Input(bridge.index, Channel.FRAMES)
+        torques = [Input(robot.index, Channel.TORQUE) for robot in plan.robots]
         self.stages = (
-            Stage("report", -3, self._period_ns, (), self._report, self._first_ns),
-            Stage(
-                "serve",
-                2 * deepest + 5,
-                self._period_ns,
-                (Input(bridge.index, Channel.FRAMES), *robots),
-                self._serve,
-                self._first_ns,
-            ),
+            Stage(Turn.REPORT, self._period_ns, (), self._report, self._first_ns),
+            Stage(Turn.SERVE, self._period_ns, (carried, *torques), self._serve, self._first_ns),
         )
 
     def _report(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
@@ -194,25 +191,21 @@ class DriveBank:
     def _drive_of(self, robot: int, wheel: int) -> PlacedDrive:
         return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
-    def result(self) -> dict[str, Any]:
-        """Returns what there is to say of the drives for a run's summary."""
-        return {"robots": self.summary(), "refused": dict(self.refused)}
-
-    def lost_rows(self) -> list[dict[str, Any]]:
-        """Returns what was lost before it came to a bus, bus by bus, for `bridge.buses.merge_rows`."""
+    def report(self) -> DrivesReport:
+        """Returns the report of all drives; its buses hold the frames that were lost before they came to a bus."""
         lost: list[Counter[int]] = [Counter() for _ in self._plan.can.buses]
         for placed in self.drives:
             lost[placed.place.bus] += placed.lost
-        return [lost_row(of_bus) for of_bus in lost]
+        return DrivesReport(
+            robots={robot.name: self._robot_report(robot.index) for robot in self._plan.robots},
+            refused=dict(self.refused),
+            buses=tuple(lost_report(self._plan, number, of_bus) for number, of_bus in enumerate(lost)),
+        )
 
-    def summary(self) -> dict[str, Any]:
-        """Returns what the drives of every robot saw: refused frames by reason, frames lost for want of room."""
-        rows: dict[str, dict[str, Any]] = {
-            robot.name: {"refused": Counter[str](), "lost": 0, "temperature": 0.0} for robot in self._plan.robots
-        }
-        for placed in self.drives:
-            row = rows[self._plan.robots[placed.place.robot].name]
-            row["refused"] += placed.drive.refused
-            row["lost"] += placed.lost.total()
-            row["temperature"] = max(row["temperature"], *(motor.temperature for motor in placed.drive.motors))
-        return rows
+    def _robot_report(self, robot: int) -> DriveReport:
+        placed = self._of_robot[robot]
+        return DriveReport(
+            refused=sum((one.drive.refused for one in placed), Counter[str]()),
+            lost=sum(one.lost.total() for one in placed),
+            temperature=max(0.0, *(motor.temperature for one in placed for motor in one.drive.motors)),
+        )

@@ -21,6 +21,7 @@ from typing import Final
 from echelon.bridge.bus_load import worst_case_bits
 from echelon.bridge.cia402.codec import HEARTBEAT_ID, TPDO_IDS
 from echelon.bridge.frame import Frame
+from echelon.bridge.reports import TimingReport
 from echelon.bridge.wheel_check import WheelCheck
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
@@ -170,19 +171,19 @@ class Watch:
         elif gap_ns > self._longest_ns:
             self._longest_ns = gap_ns
 
-    def row(self) -> dict[str, float | None]:
-        """Frames in all; of the run, the distances between them [s], `jitter` is their standard deviation."""
+    def report(self) -> TimingReport:
+        """Returns the frames in all, and the periods between those of the run."""
         count = self._gaps
         if not count:
-            return {"frames": self.frames} | dict.fromkeys(("period_mean", "period_min", "period_max", "jitter"))
+            return TimingReport(self.frames)
         variance = (count * self._squares - self._sum * self._sum) / (count * count)
-        return {
-            "frames": self.frames,
-            "period_mean": (self._first_gap_ns + self._sum / count) / 1e9,
-            "period_min": self._shortest_ns / 1e9,
-            "period_max": self._longest_ns / 1e9,
-            "jitter": float(variance**0.5) / 1e9,
-        }
+        return TimingReport(
+            frames=self.frames,
+            period_mean=(self._first_gap_ns + self._sum / count) / 1e9,
+            period_min=self._shortest_ns / 1e9,
+            period_max=self._longest_ns / 1e9,
+            jitter=float(variance**0.5) / 1e9,
+        )
 
 
 class Lane:

@@ -24,19 +24,20 @@ is not closed there are torques alone, one per acceleration period, and nobody a
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from echelon.bridge.canlog import read_log
 from echelon.bridge.due import Lane
 from echelon.bridge.frame import Frame
 from echelon.bridge.observe import Finding, Observer
 from echelon.bridge.protocols import shared_cyclic
+from echelon.bridge.reports import FindingReport, RefereeReport
 from echelon.bridge.wheel_check import WheelCheck
 from echelon.can_plan import NEVER_NS
 from echelon.plan import Plan
 
 KEPT: Final = 100
-"""Findings that the summary tells in full"""
+"""Findings that a report holds in full"""
 WAIT_NS: Final = 1_000_000_000
 """Feedback is taken to have waited for the bus no longer than this"""
 SCAN_NS: Final = 50_000_000
@@ -60,8 +61,8 @@ class Referee:
         self.unknown = 0
         """Frames with identifiers that no robot of the plan uses"""
         self.kinds: Counter[str] = Counter()
-        self.kept: list[dict[str, Any]] = []
-        """The first findings, ready for JSON"""
+        self.kept: list[FindingReport] = []
+        """The first findings"""
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
         self._late = late
         self._silence_ns = plan.can.watchdog_ns
@@ -156,21 +157,22 @@ class Referee:
                 said.append(self._tell(bus, robot, Finding(time_ns, watch.can_id, "missing", text)))
         return said
 
-    def summary(self) -> dict[str, Any]:
-        """Returns what was seen and found, ready for JSON; times in seconds."""
+    def report(self, source: str = "can.log") -> RefereeReport:
+        """Returns what was seen and found; `source` is what it listened to."""
         names = [bus.name for bus in self.plan.can.buses]
-        return {
-            "frames": self.frames,
-            "unknown": self.unknown,
-            "kinds": dict(sorted(self.kinds.items())),
-            "findings": list(self.kept),
-            "identifiers": {
-                f"{name}:{watch.can_id:03X}": watch.row()
+        return RefereeReport(
+            frames=self.frames,
+            unknown=self.unknown,
+            kinds=dict(sorted(self.kinds.items())),
+            findings=tuple(self.kept),
+            identifiers={
+                f"{name}:{watch.can_id:03X}": watch.report()
                 for name, lane in zip(names, self._lanes, strict=True)
                 for watch in sorted(lane.watches.values(), key=lambda watch: watch.can_id)
                 if watch.frames
             },
-        }
+            source=source,
+        )
 
     def _scan(self, time_ns: int, bus: int, can_id: int | None = None, ended: bool = False) -> Iterator[Finding]:
         """Tells which cyclic identifiers are silent, but for the one that has just come."""
@@ -192,20 +194,20 @@ class Referee:
         self.kinds[finding.kind] += 1
         if len(self.kept) < KEPT:
             self.kept.append(
-                {
-                    "time": finding.time_ns / 1e9,
-                    "bus": self.plan.can.buses[bus].name,
-                    "id": f"{finding.can_id:03X}",
-                    "kind": finding.kind,
-                    "text": finding.text,
-                    "robot": robot.name if robot is not None else "",
-                }
+                FindingReport(
+                    time=finding.time_ns / 1e9,
+                    bus=self.plan.can.buses[bus].name,
+                    id=f"{finding.can_id:03X}",
+                    kind=finding.kind,
+                    text=finding.text,
+                    robot=robot.name if robot is not None else "",
+                )
             )
         return finding
 
 
-def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> dict[str, Any]:
-    """Returns the referee's summary of a run's can.log.  One that ends before the run should is silence, if it is `whole`.
+def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> RefereeReport:
+    """Returns the referee's report on a run's can.log.  One that ends before the run should is silence, if it is `whole`.
 
     Raises OSError if it cannot be read."""
     referee = Referee(plan, tolerance_ns=tolerance_ns)
@@ -214,7 +216,7 @@ def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole:
         last_ns = time_ns
         referee.observe(time_ns, bus, frame)
     referee.finish(max(last_ns, plan.duration_ns) if whole else last_ns)
-    return referee.summary()
+    return referee.report()
 
 
 def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:

@@ -5,9 +5,9 @@ centroid from its parent (the root: from the law of the centroid), adds its own 
 acceleration per child: a = Φ_node⁻¹ (ν_shape, a_centroid).  Because Φ_M is built of the nodes, so is its inverse: the
 robots' accelerations are those of the central law (`controller.laws.central.CentralLaw`).
 
-What travels besides: error rates of all blocks, where blocks are coupled; and forces of avoidance.  A pair of robots
-belongs to the lowest node that has both below it: that node computes its ∇f from the positions its children sent up.
-Above that node the pair's two forces cancel in every mean, below it they are handed down.
+Two more things travel with these (`echelon.layout`): error rates of all blocks, where blocks are coupled, and forces of
+avoidance.  A pair of robots belongs to the lowest node that has both below it: that node computes its ∇f from the positions
+its children sent up.  Above that node the pair's two forces cancel in every mean, below it they are handed down.
 
 The linear law is linear in what a node knows, but for the forces.  So its matrices are multiplied out once (`NodeLaw`), and
 a period costs one product upwards and one downwards.  Any other law is asked block by block besides (`NodeBlocks`).
@@ -15,6 +15,7 @@ a period costs one product upwards and one downwards.  Any other law is asked bl
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -22,9 +23,11 @@ from echelon.controller.laws.in_tree import BlockGains, NodeBlocks
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import desired_shape, node_matrix
+from echelon.layout import CENTROID, NodeLayout
 from echelon.messages import NULL, Channel, Heard, Message, Values
 from echelon.plan import Array, NodePlan, Plan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,57 +89,33 @@ class TreeNode:
     """One node of a plan's tree as a role."""
 
     def __init__(self, plan: Plan, index: int) -> None:
-        node = next(node for node in plan.nodes if node.index == index)
-        by_index = {other.index: other for other in plan.nodes}
-        parent = None if node.parent is None else by_index[node.parent]
-        count = len(node.children)
+        node = plan.nodes[index - len(plan.robots)]
         self.index = index
-        self._node, self._is_root, self._coupled = node, parent is None, plan.coupled
+        self._node = node
+        self._parent = None if node.parent is None else plan.nodes[node.parent - len(plan.robots)]
+        self._coupled = plan.coupled
+        self._layout = NodeLayout.of(plan, node)
         self._law = NodeLaw.of(plan, node)
         self._blocks = NodeBlocks.of(plan, node)
-        self._trajectory = make_trajectory(plan.trajectory) if parent is None else None
-        self._z_cd: Array = np.zeros(6)
-        self._child_is_node = [child in by_index for child in node.children]
-        self._has_groups, self._has_robots = any(self._child_is_node), not all(self._child_is_node)
-        self._s: Array | None = None  # of the children, once all of them have been heard
+        self._trajectory = make_trajectory(plan.trajectory) if node.parent is None else None
+        self._pair_forces = _pair_forces(plan, node) if plan.avoidance.enabled else None
+        self._no_forces = np.zeros(2 * node.robots)
 
-        # Error rates of all blocks below (the root: then of its own and of the centroid), positions of all robots below,
-        # and where each child's part of them stands.
-        self._rates_at: list[tuple[int, int]] = []
-        self._robots_at: list[tuple[int, int]] = []
-        rates = robots = 0
-        for child, weight in zip(node.children, node.weights, strict=True):
-            more = 2 * (weight - 1) if plan.coupled and child in by_index else 0
-            self._rates_at.append((rates, rates + more))
-            self._robots_at.append((robots, robots + weight))
-            rates, robots = rates + more, robots + weight
-        self._own_rates = rates
-        self._rates = np.zeros(rates + (2 * count if plan.coupled and parent is None else 0))
-        self._below = [self._rates] if rates else []
-        self._positions = np.zeros((robots, 2))
-        self._no_forces = np.zeros(2 * robots)
-        self._forces: PairForces | None = None
-        if plan.avoidance.enabled:
-            pairs = pairs_between([range(first, last) for first, last in self._robots_at])
-            self._forces = PairForces(*pairs, robots, plan.avoidance)
+        # What it gathers, and steers with:
+        self._s: Array | None = None
+        """Of the children, once all of them have been heard"""
+        self._state: Array = NULL
+        """What its own GROUP_STATE says"""
+        self._z_cd: Array = NULL
+        """Desired centroid (z_cd, ż_cd, z̈_cd), known to the root"""
 
-        # Where this node's part stands in its parent's reference.
-        self._acceleration_at = self._all_rates_at = self._forces_at = self._parent_period_ns = 0
-        if parent is not None:
-            self._acceleration_at = 2 * node.child_number
-            self._all_rates_at = 2 * len(parent.children)
-            self._forces_at = self._all_rates_at + (2 * len(plan.robots) if plan.coupled else 0)
-            self._forces_at += 2 * (node.first_robot - parent.first_robot)
-            self._parent_period_ns = parent.period_ns
-        self._all_rates = slice(self._all_rates_at, self._all_rates_at + (2 * len(plan.robots) if plan.coupled else 0))
-
-        deepest = max(other.depth for other in plan.nodes)
-        kinds = [Channel.GROUP_STATE if is_node else Channel.STATE for is_node in self._child_is_node]
-        children = tuple(Input(child, kind) for child, kind in zip(node.children, kinds, strict=True))
-        parents = () if parent is None else (Input(parent.index, Channel.REFERENCE),)
+        children = tuple(
+            Input(child, Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE) for child in node.children
+        )
+        parents = () if node.parent is None else (Input(node.parent, Channel.REFERENCE),)
         self.stages = (
-            Stage("gather", 1 + deepest - node.depth, node.period_ns, children, self._gather),
-            Stage("steer", 2 + deepest + node.depth, node.period_ns, parents, self._steer),
+            Stage(Turn.GATHER, node.period_ns, children, self._gather, depth=node.depth),
+            Stage(Turn.STEER, node.period_ns, parents, self._steer, depth=node.depth),
         )
 
     def _gather(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
@@ -144,71 +123,72 @@ class TreeNode:
         said = [message.values for message in heard if message is not None]
         if len(said) < len(heard):
             self._s = None
-            return self._group_state(time_ns, NULL)
-        self._s = s = np.concatenate([values[:4] for values in said])
-        if self._forces is not None or self._has_groups:
-            self._gather_rest(said)
+            return self._say_up(time_ns, NULL)
+        self._s = s = np.concatenate([values[CENTROID] for values in said])
         own = self._law.up @ s
+        layout = self._layout.state
+        self._state = state = np.empty(layout.size)
+        state[layout.centroid] = own[:4]
+        if self._coupled:
+            state[layout.own_rates] = own[4:]
+        for child, there, here in self._layout.carried:
+            state[here] = said[child][there]
         if self._trajectory is not None:
-            self._z_cd = self._trajectory.at(time_ns * 1e-9).ravel()
+            self._z_cd = z_cd = self._trajectory.at(time_ns * 1e-9).ravel()
             if self._coupled:
-                self._rates[self._own_rates : -2] = own[4:]
-                self._rates[-2:] = own[2:4] - self._z_cd[2:4]
-            return ()
-        parts = [own[:4], *self._below, own[4:]] if self._coupled else [own[:4]]
-        if self._forces is not None:
-            parts.append(self._positions.ravel())
-        return self._group_state(time_ns, np.concatenate(parts))
-
-    def _gather_rest(self, said: list[Values]) -> None:
-        """Takes what else the children say: error rates of blocks and positions of robots below them."""
-        for at, values in enumerate(said):
-            first_robot, last_robot = self._robots_at[at]
-            if self._child_is_node[at]:
-                first, last = self._rates_at[at]
-                self._rates[first:last] = values[4 : 4 + last - first]
-                if self._forces is not None:
-                    self._positions[first_robot:last_robot] = values[4 + last - first :].reshape(-1, 2)
-            elif self._forces is not None:
-                self._positions[first_robot] = values[:2]
-
-    def _group_state(self, time_ns: int, values: Values) -> tuple[Message, ...]:
-        if self._is_root or time_ns % self._parent_period_ns:
-            return ()
-        return (Message(Channel.GROUP_STATE, self.index, time_ns // self._parent_period_ns, time_ns, values),)
+                state[layout.centroid_rates] = own[2:4] - z_cd[2:4]
+        return self._say_up(time_ns, state)
 
     def _steer(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the parent's reference; returns references and commands for the children."""
-        law, s = self._law, self._s
-        if self._is_root:
-            c, all_rates = self._z_cd, self._rates
-        elif heard[0] is not None:
-            reference = heard[0].values
-            c = reference[self._acceleration_at : self._acceleration_at + 2]
-            all_rates = reference[self._all_rates]
+        law, layout, s, state = self._law, self._layout, self._s, self._state
+        mine = layout.mine
+        if mine is None:
+            c, all_rates = self._z_cd, state[layout.state.rates]
+        elif (message := heard[0]) is not None:
+            reference = message.values
+            c, all_rates = reference[mine.acceleration], reference[mine.rates]
         else:
             s = None
         if s is None:
-            return self._down(time_ns, NULL, NULL)
+            return self._say_down(time_ns, NULL, NULL)
         accelerations = law.down @ np.concatenate((s, c, all_rates)) + law.constant
         if self._blocks is not None:
             accelerations += self._blocks(time_ns * 1e-9, s, c)
-        if self._forces is None:
-            further: tuple[Array, ...] = (accelerations, all_rates)
-        else:
-            near = self._forces(self._positions)
+        forces = NULL
+        if self._pair_forces is not None:
+            near = self._pair_forces(state[layout.state.positions].reshape(-1, 2))
             forces = self._no_forces if near is None else near.ravel()
-            if not self._is_root:
-                forces = forces + reference[self._forces_at : self._forces_at + forces.size]
+            if mine is not None:
+                forces = forces + reference[mine.forces]
             accelerations += law.of_forces @ forces
-            further = (accelerations, all_rates, forces)
-        return self._down(time_ns, np.concatenate(further) if self._has_groups else NULL, accelerations)
+        if (parts := layout.reference) is None:
+            return self._say_down(time_ns, NULL, accelerations)
+        further = np.empty(parts.size)
+        further[parts.accelerations] = accelerations
+        further[parts.rates] = all_rates
+        further[parts.forces] = forces
+        return self._say_down(time_ns, further, accelerations)
 
-    def _down(self, time_ns: int, reference: Values, command: Values) -> tuple[Message, ...]:
+    def _say_up(self, time_ns: int, state: Values) -> tuple[Message, ...]:
+        """Returns the message to the parent, at instants at which it wants one."""
+        if self._parent is None or time_ns % self._parent.period_ns:
+            return ()
+        return (Message(Channel.GROUP_STATE, self.index, time_ns // self._parent.period_ns, time_ns, state),)
+
+    def _say_down(self, time_ns: int, reference: Values, command: Values) -> tuple[Message, ...]:
+        """Returns the messages to the children: to the nodes among them, and to the robots."""
         number = time_ns // self._node.period_ns
         messages = []
-        if self._has_groups:
+        if self._layout.reference is not None:
             messages.append(Message(Channel.REFERENCE, self.index, number, time_ns, reference))
-        if self._has_robots:
+        if self._layout.command is not None:
             messages.append(Message(Channel.COMMAND, self.index, number, time_ns, command))
         return tuple(messages)
+
+
+def _pair_forces(plan: Plan, node: NodePlan) -> PairForces:
+    """Returns the forces between robots that stand below different children of a node."""
+    bounds = accumulate(node.weights, initial=0)
+    below = [range(first, last) for first, last in pairwise(bounds)]
+    return PairForces(*pairs_between(below), node.robots, plan.avoidance)

@@ -53,7 +53,7 @@ class Transformation:
 
     def __init__(self, plan: Plan) -> None:
         robots = len(plan.robots)
-        mean = np.zeros((len(plan.members), robots))  # row per member: the mean over the robots below it
+        mean = np.zeros((len(plan.formation), robots))  # row per member: the mean over the robots below it
         mean[:robots] = np.eye(robots)
         rows, desired = [], []
         for node in plan.nodes:

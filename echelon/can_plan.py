@@ -133,8 +133,8 @@ class EventPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class StationPlan:
-    """A process between robots and their wheels, on the closed torque path: the bridge, or the virtual drives."""
+class BusRolePlan:
+    """A role between robots and their wheels, on the closed torque path: the bridge, or the virtual drives."""
 
     index: int
     role: str

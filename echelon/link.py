@@ -6,7 +6,8 @@ at every speed and in every start order.  The draws come from Philox 4x64, a cou
 link, the counter the message, so any draw can be made without the ones before it.
 
 A message is used at the first tick at or after its arrival, and the newest that has arrived is the one in use
-(policy *hold*): one that is overtaken arrives, but changes nothing.
+(policy *hold*): one that is overtaken arrives, but changes nothing.  On an *ideal* link, without delay and loss, that is the
+newest that was sent, and nothing is drawn.
 """
 
 import hashlib
@@ -64,6 +65,8 @@ class Link:
         "_block",
         "_block_number",
         "_delivered",
+        "_due_ns",
+        "_first_ns",
         "_flying",
         "_held",
         "_ideal",
@@ -71,6 +74,7 @@ class Link:
         "_last",
         "_lost",
         "_newest",
+        "_period_ns",
         "_sent",
         "_used",
         "plan",
@@ -80,12 +84,18 @@ class Link:
         self.plan = plan
         self._key = link_key(seed, source, receiver, plan.channel)
         self._ideal = plan.ideal
+        self._first_ns, self._period_ns = plan.first_ns, plan.period_ns
         self._block: list[list[float]] = []
         self._block_number = -1
+        self._due_ns = plan.first_ns  # when the next message is sent
         self._sent = self._delivered = self._lost = self._used = self._held = 0
         self._newest = self._last = -1
         self._flying: list[tuple[int, int]] = []
         self._age_sum = self._age_max = 0
+
+    def sent_ns(self, sequence: int) -> int:
+        """Returns when message number `sequence` is sent [ns]."""
+        return self._first_ns + sequence * self._period_ns
 
     def fate(self, sequence: int) -> int | None:
         """Returns the delay [ns] of message number `sequence`, or None if it is lost."""
@@ -103,20 +113,21 @@ class Link:
     def arrived(self, sequence: int, time_ns: int) -> bool:
         """True if message number `sequence` is not lost and has arrived by `time_ns`."""
         delay = self.fate(sequence)
-        return delay is not None and sequence * self.plan.period_ns + delay <= time_ns
+        return delay is not None and self.sent_ns(sequence) + delay <= time_ns
 
     def newest(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
-        period = self.plan.period_ns
         if self._ideal:
-            return (time_ns - self.plan.first_ns) // period
-        while self._sent * period <= time_ns:
+            self._newest = newest = (time_ns - self._first_ns) // self._period_ns
+            return newest
+        while self._due_ns <= time_ns:
             delay = self.fate(self._sent)
             if delay is None:
                 self._lost += 1
             else:
-                heappush(self._flying, (self._sent * period + delay, self._sent))
+                heappush(self._flying, (self._due_ns + delay, self._sent))
             self._sent += 1
+            self._due_ns += self._period_ns
         while self._flying and self._flying[0][0] <= time_ns:
             _, sequence = heappop(self._flying)
             self._delivered += 1
@@ -134,11 +145,11 @@ class Link:
                 self._age_max = age
         self._last = sequence
 
-    def counts(self, newest: int) -> LinkCounts:
-        """Returns what became of the messages up to the last instant asked for, when number `newest` was in use."""
+    def counts(self) -> LinkCounts:
+        """Returns what became of the messages up to the last instant that `newest` was asked for."""
         sent, delivered = self._sent, self._delivered
         if self._ideal:
-            sent = delivered = newest + 1
+            sent = delivered = self._newest + 1
         return LinkCounts(
             self.plan.source,
             self.plan.receiver,

@@ -13,7 +13,7 @@ from typing import Final
 
 from echelon.link import Link, LinkCounts
 from echelon.messages import Heard, Message
-from echelon.plan import Plan
+from echelon.plan import LinkPlan, Plan
 from echelon.role import Input, Role
 
 LEAD: Final = 32
@@ -21,7 +21,6 @@ LEAD: Final = 32
 on without them, and what it sends would pile up in front of them."""
 SLACK: Final = 4 * LEAD
 """Messages that an input may hold beyond those in flight before it looks for lost ones among them."""
-_NO_LIMIT: Final = 1 << 62
 
 
 @dataclass(slots=True)
@@ -29,40 +28,32 @@ class _Slot:
     """One input: its link, the message in use with its number, and the newer ones that have come, by number."""
 
     link: Link
-    ideal: bool
-    period_ns: int
+    plan: LinkPlan
     many: int
     """More messages than this cannot all be in flight: those that the link loses are then forgotten."""
-    first_ns: int
-    timeout_ns: int
-    size: int | None
-    """Values of a message that says something; None if that varies."""
-    lead_ns: int
-    """So far the role may be ahead of the newest message that has come, whatever the link does with it."""
+    lead_ns: int | None
+    """How far the role may be ahead of the newest message that has come, whatever the link does with it; None: no limit, or
+    an ideal link, where the role waits for every message anyway."""
     current: Message | None = None
     in_use: int = -1
     newer: dict[int, Message] = field(default_factory=dict)
     newest: int = -1
-    wanted: int = -1
 
 
 class Mailbox:
-    """All inputs of one role; with `paced`, it misses something too while it is `LEAD` ahead of a source."""
+    """All inputs of one role; with `paced`, the role also misses something while it is `LEAD` ahead of a source."""
 
     def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
-        members = plan.everyone
-        receiver = members[role.index].name
+        names = [one.name for one in plan.all_roles]
         tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._slots = {
             (link.channel, link.source): _Slot(
-                Link(link, plan.seed, members[link.source].name, receiver),
-                link.ideal,
-                link.period_ns,
+                Link(link, plan.seed, names[link.source], names[role.index]),
+                link,
                 2 * (link.delay_max_ns // link.period_ns) + SLACK,
-                link.first_ns,
-                link.timeout_ns,
-                link.size,
-                max(LEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns) if paced else _NO_LIMIT,
+                max(LEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
+                if paced and not link.ideal
+                else None,
             )
             for link in plan.links_into(role.index)
         }
@@ -80,7 +71,7 @@ class Mailbox:
         slot = self._slots.get((message.channel, message.source))
         if slot is None:
             self.unexpected += 1
-        elif message.values.size != slot.size and message.values.size and slot.size is not None:
+        elif message.values.size != slot.plan.size and message.values.size and slot.plan.size is not None:
             self.misshapen += 1
         elif message.sequence > slot.in_use:
             slot.newer[message.sequence] = message
@@ -91,15 +82,12 @@ class Mailbox:
         """Returns the links whose message in use at `time_ns` has not come; empty if the stage can run."""
         waiting = []
         for slot in self._stage_slots[stage]:
-            if slot.ideal:
-                number = (time_ns - slot.first_ns) // slot.period_ns
-            else:
-                number = slot.link.newest(time_ns)
-                if slot.newest * slot.period_ns < time_ns - slot.lead_ns:
-                    waiting.append(slot.link)
-                    continue
-            if number > slot.in_use and number not in slot.newer:
-                waiting.append(slot.link)
+            link = slot.link
+            number = link.newest(time_ns)
+            if (number > slot.in_use and number not in slot.newer) or (
+                slot.lead_ns is not None and link.sent_ns(slot.newest) < time_ns - slot.lead_ns
+            ):
+                waiting.append(link)
         return waiting
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
@@ -110,10 +98,8 @@ class Mailbox:
         """
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
-            newer = slot.newer
-            slot.wanted = number = (
-                (time_ns - slot.first_ns) // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
-            )
+            link, newer = slot.link, slot.newer
+            number = link.newest(time_ns)
             if newer:
                 if number not in newer and number > slot.in_use:
                     number = self._newest_come(slot, time_ns)
@@ -124,12 +110,12 @@ class Mailbox:
                             newer.pop(overtaken, None)
                     slot.current, slot.in_use = message, number
                 elif len(newer) > slot.many:
-                    slot.newer = {each: newer[each] for each in newer if slot.link.fate(each) is not None}
+                    slot.newer = {each: newer[each] for each in newer if link.fate(each) is not None}
             current = slot.current
-            if current is None or not current.values.size or time_ns - current.time_ns > slot.timeout_ns:
+            if current is None or not current.values.size or time_ns - current.time_ns > slot.plan.timeout_ns:
                 heard.append(None)
             else:
-                slot.link.note_use(time_ns, current.sequence, current.time_ns)
+                link.note_use(time_ns, current.sequence, current.time_ns)
                 heard.append(current)
         return heard
 
@@ -140,4 +126,4 @@ class Mailbox:
 
     def counts(self) -> list[LinkCounts]:
         """Returns the counts of every link into this role."""
-        return [slot.link.counts(slot.wanted) for slot in self._slots.values()]
+        return [slot.link.counts() for slot in self._slots.values()]

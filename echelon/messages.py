@@ -25,7 +25,7 @@ class Channel(IntEnum):
     """Robot to leader: `STATE_FIELDS`."""
     GROUP_STATE = 2
     """Node to its parent: `GROUP_FIELDS`, then the error rates of every block below (where blocks are coupled), then
-    the positions of every robot below (where robots avoid each other)."""
+    the positions of every robot below (where robots avoid each other); `echelon.layout` says where each stands."""
     REFERENCE = 3
     """Node to its child nodes: an acceleration (x, y) per child, then the error rates of all blocks (where coupled),
     then the avoidance force (x, y) on every robot below (where robots avoid each other)."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.can_plan import DISTURBANCES, NEVER_NS, CanPlan, DrivePlan, EnvelopePlan, EventPlan, StationPlan
+from echelon.can_plan import DISTURBANCES, NEVER_NS, BusRolePlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan
 from echelon.messages import Channel
 from echelon.plugins import Part
 
@@ -130,7 +130,7 @@ class AvoidancePlan:
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """A directed link, applied where it ends: bounds of its delay [ns], i.i.d. loss, policy for a missing input."""
+    """A directed link, applied where it ends: bounds of its delay [ns], i.i.d. loss, how long its messages may be held."""
 
     source: int
     receiver: int
@@ -139,9 +139,8 @@ class LinkPlan:
     delay_min_ns: int = 0
     delay_max_ns: int = 0
     loss: float = 0.0
-    policy: str = "hold"
     timeout_ns: int = NEVER_NS
-    """Age beyond which a message is not used any more (policy `hold_then_stop`)"""
+    """Age beyond which a message is not used any more (policy `hold_then_stop`); with policy `hold`: never"""
     first_ns: int = 0
     """Instant of message number 0: before the run begins where drives are brought up"""
     size: int | None = None
@@ -187,8 +186,9 @@ class Plan:
     can: CanPlan
     claims: tuple[ClaimPlan, ...]
     events: tuple[EventPlan, ...] = ()
-    stations: tuple[StationPlan, ...] = ()
-    """Bridge and drives, in this order, where the torque path is closed; numbered after the nodes"""
+    bus_roles: tuple[BusRolePlan, ...] = ()
+    """The bridge, then the virtual drives if there are any, where the torque path is closed (`can.closed`); otherwise
+    empty.  They are numbered after the nodes."""
 
     @property
     def root(self) -> NodePlan:
@@ -201,14 +201,24 @@ class Plan:
         return bool(self.coupling.any())
 
     @property
-    def members(self) -> tuple[RobotPlan | NodePlan, ...]:
+    def formation(self) -> tuple[RobotPlan | NodePlan, ...]:
         """Robots and nodes by index."""
         return (*self.robots, *self.nodes)
 
     @property
-    def everyone(self) -> tuple[RobotPlan | NodePlan | StationPlan, ...]:
-        """Robots, nodes and stations by index."""
-        return (*self.robots, *self.nodes, *self.stations)
+    def all_roles(self) -> tuple[RobotPlan | NodePlan | BusRolePlan, ...]:
+        """Robots, nodes, and bridge and drives where the torque path is closed, by index."""
+        return (*self.robots, *self.nodes, *self.bus_roles)
+
+    @property
+    def bridge(self) -> BusRolePlan | None:
+        """The bridge's role; None where the torque path is not closed."""
+        return self.bus_roles[0] if self.bus_roles else None
+
+    @property
+    def drives(self) -> BusRolePlan | None:
+        """The virtual drives' role; None where the drives are real, or the torque path is not closed."""
+        return self.bus_roles[1] if len(self.bus_roles) > 1 else None
 
     def links_into(self, receiver: int) -> tuple[LinkPlan, ...]:
         """The links that end at a member."""

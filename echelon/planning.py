@@ -11,7 +11,7 @@ from math import dist
 from typing import Final
 
 from echelon.blocks import fitting, make_blocks, make_coupling
-from echelon.can_plan import NEVER_NS, CanPlan, StationPlan
+from echelon.can_plan import NEVER_NS, BusRolePlan, CanPlan
 from echelon.drives import make_events
 from echelon.layout import sized
 from echelon.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
@@ -39,7 +39,7 @@ SHOWN_NAMES: Final = 12
 def make_plan(scenario: Scenario, registry: Registry) -> Plan:
     """Returns the plan of a scenario; parts that it does not name come from `registry`.  Raises PlanError."""
     robots, nodes, can = make_members(scenario, registry)
-    stations = _stations(robots, nodes, can)
+    bus_roles = _bus_roles(robots, nodes, can)
     _check_starts(robots, scenario.avoidance.avoidance_radius if scenario.avoidance.enabled else 0.0)
     duration_ns = nanoseconds(scenario.duration, "duration")
     if duration_ns % nodes[-1].period_ns:
@@ -63,11 +63,11 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         lead=scenario.law.lead,
         trajectory=scenario.trajectory,
         avoidance=AvoidancePlan(**scenario.avoidance.model_dump()),
-        links=_links(scenario.links, robots, nodes, stations, can),
+        links=_links(scenario.links, robots, nodes, bus_roles, can),
         can=can,
         claims=tuple(ClaimPlan(claim.block, claim.settled_by, claim.band) for claim in scenario.claims),
         events=make_events(scenario.events, robots, can),
-        stations=stations,
+        bus_roles=bus_roles,
     )
     return sized(plan)
 
@@ -80,15 +80,15 @@ def _check_law(law: Law) -> None:
             raise PlanError(f"law.{key}: the law {law.use!r} {what}; leave {key} out")
 
 
-def _stations(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[StationPlan, ...]:
-    """Returns bridge and drives where the torque path is closed."""
+def _bus_roles(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[BusRolePlan, ...]:
+    """Returns bridge and virtual drives where the torque path is closed."""
     if not can.closed:
         return ()
     if not can.enabled:
         raise PlanError("can.enabled = false: must be true where can.path = 'closed'")
     first, cycle_ns = len(robots) + len(nodes), robots[0].torque_period_ns
     roles = ("bridge", "drives") if can.virtual_drives else ("bridge",)
-    return tuple(StationPlan(first + at, role, cycle_ns, -can.bring_up_ns) for at, role in enumerate(roles))
+    return tuple(BusRolePlan(first + at, role, cycle_ns, -can.bring_up_ns) for at, role in enumerate(roles))
 
 
 def _check_starts(robots: Sequence[RobotPlan], radius: float) -> None:
@@ -109,16 +109,16 @@ def _links(
     rules: Sequence[LinkRule],
     robots: Sequence[RobotPlan],
     nodes: Sequence[NodePlan],
-    stations: Sequence[StationPlan],
+    bus_roles: Sequence[BusRolePlan],
     can: CanPlan,
 ) -> tuple[LinkPlan, ...]:
     """Lists all links, receiver by receiver, and gives those between members what the last fitting rule says."""
-    everyone: list[RobotPlan | NodePlan | StationPlan] = [*robots, *nodes, *stations]
-    names = [one.name for one in everyone]
+    all_roles: list[RobotPlan | NodePlan | BusRolePlan] = [*robots, *nodes, *bus_roles]
+    names = [one.name for one in all_roles]
     limits = [_delay_ns(rule, f"links.{at}.delay") for at, rule in enumerate(rules)]
     used: set[int] = set()
     links = []
-    for source, receiver, channel, period_ns in [*_tree_links(robots, nodes), *_torque_links(robots, stations)]:
+    for source, receiver, channel, period_ns in [*_tree_links(robots, nodes), *_torque_links(robots, bus_roles)]:
         rule, delay_min_ns, delay_max_ns = LinkRule(), 0, 0
         for at, (each, limit) in enumerate(zip(rules, limits, strict=True)):
             if (
@@ -128,40 +128,39 @@ def _links(
             ):
                 used.add(at)
                 rule, (delay_min_ns, delay_max_ns) = each, limit
-        policy, timeout_ns = rule.policy or ("hold_then_stop" if can.closed else "hold"), NEVER_NS
-        if policy == "hold_then_stop":
+        timeout_ns = NEVER_NS
+        if (rule.policy or ("hold_then_stop" if can.closed else "hold")) == "hold_then_stop":
             # What comes more rarely than that is not late when it is that old.
             wanted = can.watchdog_ns if rule.timeout is None else round(rule.timeout * 1e9)
             timeout_ns = max(wanted, 2 * period_ns) if rule.timeout is None else wanted
-        links.append(
-            LinkPlan(source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, policy, timeout_ns)
-        )
+        links.append(LinkPlan(source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, timeout_ns))
     for at, rule in enumerate(rules):
         if at not in used:
-            raise PlanError(_why_unused(rule, f"links.{at}", names, bool(stations)))
-    return (*links, *_shaft_links(robots, stations, can))
+            raise PlanError(_why_unused(rule, f"links.{at}", names, can.closed))
+    return (*links, *_shaft_links(robots, bus_roles, can))
 
 
-def _torque_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan]) -> list[tuple[int, int, Channel, int]]:
+def _torque_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan]) -> list[tuple[int, int, Channel, int]]:
     """Returns the links from robots to the bridge: over them go torques, and they can be late or lose."""
-    bridge = stations[:1]
-    return [(robot.index, to.index, Channel.TORQUE, to.period_ns) for to in bridge for robot in robots]
+    return [
+        (robot.index, bridge.index, Channel.TORQUE, bridge.period_ns) for bridge in bus_roles[:1] for robot in robots
+    ]
 
 
-def _shaft_links(robots: Sequence[RobotPlan], stations: Sequence[StationPlan], can: CanPlan) -> list[LinkPlan]:
+def _shaft_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan], can: CanPlan) -> list[LinkPlan]:
     """Returns the links that stand for no network: shafts, and what the bus itself does (bridge.bus_time)."""
     links: list[LinkPlan] = []
-    if not stations:
+    if not can.closed:
         return links
-    bridge, drives = stations[0].index, [station.index for station in stations[1:]]
-    period_ns, first_ns = stations[0].period_ns, stations[0].first_ns
+    bridge, *drives = bus_roles
+    period_ns, first_ns = bridge.period_ns, bridge.first_ns
     # A plant whose bridge says nothing has no torque: its drives have stopped by then.
-    stop = {"policy": "hold_then_stop", "timeout_ns": max(can.watchdog_ns, 2 * period_ns)}
-    links += [LinkPlan(bridge, robot.index, Channel.WHEELS, period_ns, **stop) for robot in robots]  # type: ignore[arg-type]
-    for index in drives:
-        links.append(LinkPlan(bridge, index, Channel.FRAMES, period_ns, first_ns=first_ns))
-        links.append(LinkPlan(index, bridge, Channel.FRAMES, period_ns, first_ns=first_ns))
-        links += [LinkPlan(robot.index, index, Channel.TORQUE, period_ns) for robot in robots]
+    timeout_ns = max(can.watchdog_ns, 2 * period_ns)
+    links += [LinkPlan(bridge.index, robot.index, Channel.WHEELS, period_ns, timeout_ns=timeout_ns) for robot in robots]
+    for each in drives:
+        links.append(LinkPlan(bridge.index, each.index, Channel.FRAMES, period_ns, first_ns=first_ns))
+        links.append(LinkPlan(each.index, bridge.index, Channel.FRAMES, period_ns, first_ns=first_ns))
+        links += [LinkPlan(robot.index, each.index, Channel.TORQUE, period_ns) for robot in robots]
     return links
 
 

@@ -25,6 +25,7 @@ from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.role import Role, Stage
 from echelon.session import Publisher, Session
+from echelon.turns import deadline_ns
 from echelon.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
 
 STALL_S: Final = 1.0
@@ -90,7 +91,7 @@ class Runner:
     """One role of a plan, connected.  Declares everything it sends and receives when it is made."""
 
     def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool, virtual: bool) -> None:
-        members = plan.everyone
+        members = plan.all_roles
         member = members[role.index]
         self.role, self.plan = role, plan
         self.mailbox = Mailbox(role, plan, paced=virtual)
@@ -209,13 +210,12 @@ class Runner:
     def wall_clock(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
 
-        Within a period, stages have deadlines in the order of their levels; the last ends with the period.  A stage runs as
-        soon as nothing it wants is missing, in the handler of what came last; at its deadline it runs with what there is.
+        A stage runs as soon as nothing it wants is missing, in the handler of what came last; at the deadline of its turn
+        (`echelon.turns`) it runs with what there is.
         """
-        # Stations between robots and wheels take turns before and after the members.
-        early, late = (3, 5) if self.plan.stations else (0, 3)
-        levels = early + max(node.depth for node in self.plan.nodes) * 2 + late
-        self._allowed_ns = [stage.period_ns * (early + stage.level) // levels for stage in self.role.stages]
+        self._allowed_ns = [
+            deadline_ns(self.plan, stage.turn, stage.depth, stage.period_ns) for stage in self.role.stages
+        ]
         self._start_ns = start_ns
         while True:
             with self._lock:

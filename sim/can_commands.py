@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from rich.console import Console
 from rich.live import Live
@@ -15,13 +15,15 @@ from rich.text import Text
 
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import interface_is_up, resolve_url
-from echelon.bridge.closed import LOG
 from echelon.bridge.frame import Frame
 from echelon.bridge.referee import Referee, judge_log, read_run_log
+from echelon.bridge.reports import RefereeReport
+from echelon.bridge.stations.closed import LOG
 from echelon.load import ScenarioError
 from echelon.plan import Plan
 from echelon.sim.can_table import CanTable, finding_text
 from echelon.sim.parts import parse
+from echelon.sim.results.rendering import json_text
 from echelon.sim.usage import UsageError, scenario_of
 
 TICK_S: Final = 0.1
@@ -87,7 +89,7 @@ def can(arguments: argparse.Namespace, console: Console | None = None) -> int:
     return 0
 
 
-def _judge_run(folder: Path, plan: Plan) -> dict[str, Any]:
+def _judge_run(folder: Path, plan: Plan) -> RefereeReport:
     """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Raises OSError."""
     try:
         run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
@@ -102,26 +104,24 @@ def referee(arguments: argparse.Namespace) -> int:
     plan, folder = _plan_of(arguments)
     if folder is not None and arguments.can is None:
         try:
-            summary = _judge_run(folder, plan)
+            report = _judge_run(folder, plan)
         except OSError as error:
             raise UsageError(f"{folder / LOG}: {error.strerror}") from None
-        said = len(summary["findings"])
+        said = len(report.findings)
     else:
-        summary = _judge_live(plan, arguments)
+        report = _judge_live(plan, arguments)
         said = 0
     if arguments.json:
-        print(json.dumps(summary, indent=2, allow_nan=False))
+        print(json_text(report))
     else:
-        for finding in summary["findings"][:said]:
-            where = f"{finding['robot']} " if finding["robot"] else ""
-            print(
-                f"{finding['time']:.6f} s  {finding['bus']} {finding['id']}  {where}{finding['kind']}: {finding['text']}"
-            )
-        print(_verdict(summary))
-    return 1 if summary["kinds"] else 0
+        for finding in report.findings[:said]:
+            where = f"{finding.robot} " if finding.robot else ""
+            print(f"{finding.time:.6f} s  {finding.bus} {finding.id}  {where}{finding.kind}: {finding.text}")
+        print(_verdict(report))
+    return 1 if report.kinds else 0
 
 
-def _judge_live(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
+def _judge_live(plan: Plan, arguments: argparse.Namespace) -> RefereeReport:
     """Listens until told to end; tells the first findings at once."""
     tolerance = getattr(arguments, "tolerance", None)
     if tolerance is not None and not 0 <= tolerance < 1e9:
@@ -146,14 +146,14 @@ def _judge_live(plan: Plan, arguments: argparse.Namespace) -> dict[str, Any]:
     for finding in judge.finish(time_ns):
         if not arguments.json:
             print(finding_text(finding))
-    return judge.summary()
+    return judge.report("bus")
 
 
-def _verdict(summary: dict[str, Any]) -> str:
-    kinds = ", ".join(f"{kind} {count}" for kind, count in summary["kinds"].items())
-    foreign = f", {summary['unknown']} frames of others" if summary["unknown"] else ""
-    seen = f"{summary['frames']} frames of {len(summary['identifiers'])} identifiers{foreign}"
-    return f"{seen}: {sum(summary['kinds'].values())} findings: {kinds}" if kinds else f"{seen}: no findings"
+def _verdict(report: RefereeReport) -> str:
+    kinds = ", ".join(f"{kind} {count}" for kind, count in report.kinds.items())
+    foreign = f", {report.unknown} frames of others" if report.unknown else ""
+    seen = f"{report.frames} frames of {len(report.identifiers)} identifiers{foreign}"
+    return f"{seen}: {sum(report.kinds.values())} findings: {kinds}" if kinds else f"{seen}: no findings"
 
 
 class _Shown:

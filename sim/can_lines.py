@@ -1,70 +1,56 @@
-"""What a summary says of the bus, in lines for people: frames, what was stopped and why, faults, the referee's findings."""
+"""What a summary says of the buses, in lines for people: frames, what was stopped and why, faults, the referee's findings."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import Final
+
+from echelon.bridge.reports import CanReport
 
 SHOWN: Final = 5
 """How many of many are listed."""
 
 
-def can_lines(can: Mapping[str, Any]) -> Iterator[str]:
+def can_lines(can: CanReport | None) -> Iterator[str]:
     """Yields the lines of a terminal."""
-    if not can.get("frames"):
+    if can is None or not can.frames:
         return
-    facts = [f"{can['frames']} frames"]
-    if can.get("path") == "closed":
-        facts += [f"{number} {what}" for what, number in _bus_counts(can).items() if number]
+    facts = [f"{can.frames} frames"]
+    if can.path == "closed":
+        lost, destroyed = sum(bus.lost for bus in can.buses), sum(bus.destroyed for bus in can.buses)
+        facts += [f"{lost} lost"] if lost else []
+        facts += [f"{destroyed} destroyed and sent again"] if destroyed else []
     else:
-        facts.append(f"{can.get('clipped', 0)} clipped")
-    fit = can.get("fit", "")
-    if isinstance(fit, str):
-        yield f"  CAN      {', '.join(facts)}; {fit}"
+        facts.append(f"{sum(robot.clipped for robot in can.robots.values())} clipped")
+    if len(can.fit) == 1:
+        yield f"  CAN      {', '.join(facts)}; {can.fit[0]}"
     else:
         yield f"  CAN      {', '.join(facts)}"
-        yield from (f"  bus      {line}" for line in fit)
-    if events := can.get("scheduled"):
-        told = [f"{event['time']:g} s {event['what']}" for event in events]
-        yield f"  events   {_some(told)}"
-    if off := [event for bus in can.get("buses", ()) for event in bus["events"] if event["event"] == "bus-off"]:
-        told = [f"{event['who']} at {event['time']:.4g} s" for event in off]
-        yield f"  bus-off  {_some(told)}"
-    if stopped := stopped_by_reason(can):
-        reasons = ", ".join(f"{number} {reason}" for reason, number in stopped.most_common(SHOWN))
+        yield from (f"  bus      {line}" for line in can.fit)
+    if can.scheduled:
+        yield f"  events   {_some([f'{event.time:g} s {event.what}' for event in can.scheduled])}"
+    if off := [event for bus in can.buses for event in bus.events if event.event == "bus-off"]:
+        yield f"  bus-off  {_some([f'{event.who} at {event.time:.4g} s' for event in off])}"
+    if can.stopped:
+        reasons = ", ".join(f"{number} {reason}" for reason, number in islice(can.stopped.items(), SHOWN))
         yield f"  stopped  torques that became zero before the bus: {reasons}"
-    faults = [f"{name} {row['fault']}" for name, row in can.get("robots", {}).items() if row.get("fault")]
-    if faults:
+    if faults := [f"{name} {row.fault}" for name, row in can.robots.items() if row.fault]:
         yield f"  drives   faults at the end: {_some(faults)}"
-    if idle := [
-        name for name, row in can.get("robots", {}).items() if not row.get("enabled", True) and not row["fault"]
-    ]:
+    if idle := [name for name, row in can.robots.items() if row.enabled is False and not row.fault]:
         yield f"  drives   not enabled at the end: {_some(idle)}"
-    if referee := can.get("referee"):
-        found = ", ".join(f"{number} {kind}" for kind, number in referee["kinds"].items()) or "nothing wrong"
-        yield f"  referee  {referee['frames']} frames: {found}"
+    if can.referee is not None:
+        found = ", ".join(f"{number} {kind}" for kind, number in can.referee.kinds.items()) or "nothing wrong"
+        yield f"  referee  {can.referee.frames} frames: {found}"
 
 
-def can_reasons(can: Mapping[str, Any]) -> list[str]:
+def can_reasons(can: CanReport | None) -> list[str]:
     """Returns why the verdict fails for what was on the bus: the referee's findings."""
-    referee = can.get("referee")
-    if not referee or not referee["kinds"]:
+    if can is None or can.referee is None or not can.referee.kinds:
         return []
-    total, first = sum(referee["kinds"].values()), referee["findings"][0]
-    what = " ".join(filter(None, (first["bus"], first["id"], first["robot"], first["kind"])))
-    return [f"referee: {total} finding(s) on the bus, the first at {first['time']:.6g} s, {what}: {first['text']}"]
+    total, first = sum(can.referee.kinds.values()), can.referee.findings[0]
+    what = " ".join(filter(None, (first.bus, first.id, first.robot, first.kind)))
+    return [f"referee: {total} finding(s) on the bus, the first at {first.time:.6g} s, {what}: {first.text}"]
 
 
-def stopped_by_reason(can: Mapping[str, Any]) -> Counter[str]:
-    """Returns how many torques became zero before the bus, by reason, over all robots."""
-    return sum((Counter(row.get("stopped", {})) for row in can.get("robots", {}).values()), Counter[str]())
-
-
-def _bus_counts(can: Mapping[str, Any]) -> dict[str, int]:
-    buses = can.get("buses", ())
-    lost, destroyed = (sum(bus[what] for bus in buses) for what in ("lost", "destroyed"))
-    return {"lost": lost, "destroyed and sent again": destroyed}
-
-
-def _some(texts: list[str]) -> str:
+def _some(texts: Sequence[str]) -> str:
     more = f", and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
     return ", ".join(texts[:SHOWN]) + more

@@ -18,8 +18,9 @@ from typing import Any, Final
 
 from echelon.plan import Plan, RobotPlan
 from echelon.session import loopback_endpoints
-from echelon.sim.joining import ProcessSpec, Result
+from echelon.sim.contract import ProcessSpec
 from echelon.sim.process import main
+from echelon.sim.to_supervisor import Done
 
 PRELOAD: Final = ["echelon.sim.process"]
 LAST_WORDS: Final = 4000
@@ -40,7 +41,7 @@ class Child:
     """Its standard output and standard error"""
     heard_s: float
     ready: bool = False
-    result: Result | None = None
+    done: Done | None = None
     waiting_for: list[int] = field(default_factory=list)
     waiting_ns: int = -1
     said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
@@ -149,8 +150,8 @@ def list_specs(
     Every node listens and its children connect; so does the recorder, to whom everyone connects.  To bridge and drives
     robots connect, and the bridge to the drives.
     """
-    stations = [station.role for station in plan.stations]
-    if can_urls and not stations:
+    stations = [role.name for role in plan.bus_roles]
+    if can_urls and not plan.can.closed:
         stations = ["bridge"]
     hubs = (["recorder"] if recorded else []) + stations
     endpoints = loopback_endpoints(len(plan.nodes) + len(hubs))
@@ -171,7 +172,7 @@ def list_specs(
         return tuple(hub_at[name] for name in names), tuple((name, name) for name in names)
 
     specs = []
-    for member in plan.members:
+    for member in plan.formation:
         near = [] if member.parent is None else [member.parent]
         near += [] if isinstance(member, RobotPlan) else member.children
         endpoints_of, peers_of = with_hubs(recorder + (stations if isinstance(member, RobotPlan) else []))
@@ -182,8 +183,8 @@ def list_specs(
                 index=member.index,
                 listen=(at[member.index],) if member.index in at else (),
                 connect=(*(() if member.parent is None else (at[member.parent],)), *endpoints_of),
-                peers=(*((plan.members[peer].role, plan.members[peer].name) for peer in near), *peers_of),
-                watched=recorded or (bool(stations) and isinstance(member, RobotPlan) and not plan.stations),
+                peers=(*((plan.formation[peer].role, plan.formation[peer].name) for peer in near), *peers_of),
+                watched=recorded or (bool(stations) and isinstance(member, RobotPlan) and not plan.can.closed),
                 **common,
             )
         )
@@ -196,22 +197,22 @@ def list_specs(
             ProcessSpec(
                 kind=station,
                 name=station,
-                index=len(plan.members) + number,
+                index=len(plan.formation) + number,
                 listen=(hub_at[station],),
                 connect=endpoints_of,
                 peers=(*robots, *others),
                 watched=recorded,
-                member=virtual and bool(plan.stations),
+                member=virtual and plan.can.closed,
                 **common,
             )
         )
     if recorded:
-        everyone = tuple((member.role, member.name) for member in plan.members)
+        everyone = tuple((member.role, member.name) for member in plan.formation)
         specs.append(
             ProcessSpec(
                 kind="recorder",
                 name="recorder",
-                index=len(plan.members) + len(stations),
+                index=len(plan.formation) + len(stations),
                 listen=(hub_at["recorder"],),
                 connect=(),
                 peers=(*everyone, *((name, name) for name in stations)),

@@ -203,7 +203,7 @@ def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Find
     messages = sum(counts.sent for counts in engine.link_counts()) - before
     cores = len(os.sched_getaffinity(0))
     share = (spent_s + HANDLING * measured.round_trip_s * messages) / max(done, 1) / period_s / cores
-    said = f"period {period_s * 1e3:g} ms: about {100 * share:.0f} % of {cores} processors, for {len(plan.everyone)} processes"
+    said = f"period {period_s * 1e3:g} ms: about {100 * share:.0f} % of {cores} processors, for {len(plan.all_roles)} processes"
     advice = []
     if share > BUSY:
         advice.append("too much for real time: longer periods, fewer robots, or --clock virtual")

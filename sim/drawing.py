@@ -85,7 +85,7 @@ def _top_group(plan: Plan, member: int) -> int:
     nodes = [child for child in root.children if child >= len(plan.robots)]
     at: int | None = member
     while at is not None and at not in nodes:
-        at = plan.members[at].parent
+        at = plan.formation[at].parent
     return 0 if at is None else nodes.index(at)
 
 

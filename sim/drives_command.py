@@ -12,10 +12,10 @@ from typing import Final
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command
 from echelon.bridge.drive_bank import DriveBank
+from echelon.bridge.stations.waiting import RunClock
+from echelon.bridge.stations.wall_drives import WallDrives
 from echelon.drives import identifiers
 from echelon.plan import Plan, RobotPlan
-from echelon.sim.wall import RunClock
-from echelon.sim.wall_drives import WallDrives
 
 LINE_S: Final = 1.0
 """Between two lines."""
@@ -32,7 +32,8 @@ def describe(plan: Plan, urls: Sequence[str]) -> list[str]:
     width = max(len(robot.name) for robot in plan.robots)
     lines += [f"  {robot.name:<{width}}  {_place(plan, robot)}" for robot in plan.robots]
     watchdog_ms = plan.can.watchdog_ns / 1e6
-    period_ms = plan.stations[1].period_ns / 1e6
+    assert plan.drives is not None
+    period_ms = plan.drives.period_ns / 1e6
     lines.append(f"they report every {period_ms:g} ms, and stop after {watchdog_ms:g} ms without a command")
     return lines
 

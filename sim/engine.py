@@ -1,39 +1,48 @@
 """The in-process engine: all roles of a plan in one process, messages handed over directly.  The truth of the others.
 
-Stages of one instant run in the order of their levels: robots say their states, nodes gather upwards, steer downwards,
-robots move.  What the roles hear goes through the same mailboxes, and so through the same links, as between processes.
+Stages of one instant run in the order of their turns (`echelon.turns`).  What the roles hear goes through the same
+mailboxes, and so through the same links, as between processes.
 """
 
 from collections.abc import Callable, Iterator
 from itertools import groupby
 from math import gcd
+from typing import TYPE_CHECKING, cast
 
 from echelon.agents.robot import make_robot
 from echelon.controller.node import TreeNode
 from echelon.link import LinkCounts
 from echelon.mailbox import Mailbox
 from echelon.messages import Message
-from echelon.plan import Plan
+from echelon.plan import NodePlan, Plan, RobotPlan
 from echelon.role import Role
+from echelon.turns import level
+
+if TYPE_CHECKING:
+    from echelon.bridge.commander import Commander
+    from echelon.bridge.drive_bank import DriveBank
 
 Sink = Callable[[Message], None]
 
 
 def make_roles(plan: Plan) -> list[Role]:
-    """Returns the roles of a plan by index: robots, then nodes."""
-    return [make_role(plan, index) for index in range(len(plan.everyone))]
+    """Returns the roles of a plan by index."""
+    return [make_role(plan, index) for index in range(len(plan.all_roles))]
 
 
 def make_role(plan: Plan, index: int) -> Role:
-    """Returns the role of a robot, a node, or a station between robots and their wheels."""
-    if index < len(plan.robots):
+    """Returns one role of a plan: a robot, a node, or the bridge or the drives between robots and their wheels.
+
+    Raises IndexError if the plan has no role of that index."""
+    one = plan.all_roles[index]
+    if isinstance(one, RobotPlan):
         return make_robot(plan, index)
-    if index < len(plan.members):
+    if isinstance(one, NodePlan):
         return TreeNode(plan, index)
     from echelon.bridge.commander import Commander  # the protocols of drives, for two processes alone
     from echelon.bridge.drive_bank import DriveBank
 
-    return Commander(plan) if index == plan.stations[0].index else DriveBank(plan)
+    return Commander(plan) if one.role == "bridge" else DriveBank(plan)
 
 
 class Engine:
@@ -50,7 +59,15 @@ class Engine:
             receivers.setdefault((link.source, link.channel), []).append(self.mailboxes[link.receiver])
         self._receivers = receivers
         stages = [
-            (stage.level, stage.period_ns, stage.first_ns, role.index, number, stage.run, self.mailboxes[role.index])
+            (
+                level(plan, stage.turn, stage.depth),
+                stage.period_ns,
+                stage.first_ns,
+                role.index,
+                number,
+                stage.run,
+                self.mailboxes[role.index],
+            )
             for role in self.roles
             for number, stage in enumerate(role.stages)
         ]
@@ -62,6 +79,16 @@ class Engine:
         ]
         self._tick_ns = gcd(*[period for period, _, _ in self._stages])
         self._first_ns = min(first for _, first, _ in self._stages)
+
+    @property
+    def commander(self) -> "Commander | None":
+        """The role of the bridge, where the torque path is closed."""
+        return None if self.plan.bridge is None else cast("Commander", self.roles[self.plan.bridge.index])
+
+    @property
+    def drives(self) -> "DriveBank | None":
+        """The role of the virtual drives, where there are any."""
+        return None if self.plan.drives is None else cast("DriveBank", self.roles[self.plan.drives.index])
 
     def instants(self) -> Iterator[int]:
         """Runs the whole plan, from 0 (or from when drives are brought up) to its duration inclusive; yields each instant

@@ -9,9 +9,9 @@ import numpy as np
 
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS, field_index
-from echelon.sim.blocks import block_series, component_names
-from echelon.sim.measures import link_row
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import block_series, component_names
+from echelon.sim.results.measures import link_result
+from echelon.sim.results.trace import Trace
 
 ROBOT_FIELDS: Final = ("x", "y", "theta", "v", "omega", "ax", "ay", "tau_right", "tau_left")
 LINK_FIELDS: Final = (
@@ -28,8 +28,10 @@ def export_csv(trace: Trace, links: Sequence[LinkCounts], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     _write(folder / "robots.csv", ("t", "robot", *ROBOT_FIELDS), _robots(trace))
     _write(folder / "blocks.csv", ("t", "block", "component", "value", "desired", "error", "rate"), _blocks(trace))
-    rows = (link_row(trace.plan, counts) for counts in links)
-    _write(folder / "links.csv", LINK_FIELDS, (",".join(str(row[field]) for field in LINK_FIELDS) for row in rows))
+    rows = (link_result(trace.plan, counts) for counts in links)
+    _write(
+        folder / "links.csv", LINK_FIELDS, (",".join(str(getattr(row, field)) for field in LINK_FIELDS) for row in rows)
+    )
 
 
 def _robots(trace: Trace) -> Iterable[str]:

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan import Plan
-from echelon.sim.blocks import Blocks, BlockSeries
-from echelon.sim.distances import Distances
 from echelon.sim.drawing import (
     CENTROID,
     GROUPS,
@@ -27,8 +25,10 @@ from echelon.sim.drawing import (
     thin,
     time_axis,
 )
-from echelon.sim.measures import settling_ns
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import Blocks, BlockSeries
+from echelon.sim.results.distances import Distances
+from echelon.sim.results.measures import settling_ns
+from echelon.sim.results.trace import Trace
 
 Array = NDArray[np.float64]
 SMALL_MULTIPLES: Final = 16

@@ -41,7 +41,7 @@ class Display:
 
     def show(self, progress: Progress) -> None:
         """Shows how the run stands."""
-        note = progress.note or progress.can.get("note", "") or progress.can.get("drives_note", "")
+        note = progress.note or progress.bridge.note or progress.drives.note
         if note and note != self._note:
             self.say(note)
         self._note = note or self._note
@@ -94,11 +94,11 @@ class Display:
             ("real time", f"× {factor}"),
             ("messages", f"{progress.messages}"),
         ]
-        if "load" in progress.can:
-            facts.append(("CAN load", f"{100 * progress.can['load']:.0f} %"))
-        if progress.can.get("stopped"):
-            facts.append(("torques stopped", f"{progress.can['stopped']}"))
-        if faults := progress.can.get("faults"):
+        if progress.bridge.frames:
+            facts.append(("CAN load", f"{100 * progress.bridge.load:.0f} %"))
+        if progress.bridge.stopped:
+            facts.append(("torques stopped", progress.bridge.stopped))
+        if faults := progress.bridge.faults:
             facts.append(("drive faults", ", ".join(faults[:FAULTS]) + (" …" if len(faults) > FAULTS else "")))
         return facts
 
@@ -106,8 +106,8 @@ class Display:
         table = Table(box=None, padding=(0, 2), show_header=False)
         for name, value in self._facts(progress):
             table.add_row(Text(name, style="dim"), value)
-        if url := progress.can.get("url"):
-            table.add_row(Text("bus", style="dim"), str(url))
+        if progress.bridge.url:
+            table.add_row(Text("bus", style="dim"), progress.bridge.url)
         errors = Table(box=None, padding=(0, 2))
         errors.add_column("block", style="dim")
         errors.add_column("error [m]", justify="right")

@@ -1,10 +1,11 @@
 """The report's page: HTML of headings, tables, figures and verdicts, with its own style; text is escaped here."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
-from typing import Any, Final
+from typing import Final
 
-from echelon.sim.summary import number
+from echelon.sim.results.records import Summary
+from echelon.sim.results.summary import number
 
 LONG: Final = 24
 """A table's text of more characters may take several lines."""
@@ -92,12 +93,12 @@ def figure(svg: str, alternative: str, caption: str) -> str:
     return f"<figure>{drawn}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def verdict(name: str, summary: Mapping[str, Any]) -> str:
+def verdict(name: str, summary: Summary) -> str:
     """Returns a run's verdict with its reasons."""
-    holds, reasons = summary["verdict"]["holds"], summary["verdict"]["reasons"]
+    holds, reasons = summary.verdict.holds, summary.verdict.reasons
     kind, word = ("", "The verdict holds") if holds else (" fails", "The verdict fails")
     listed = "".join(f"<li>{escape(str(reason))}</li>" for reason in reasons)
-    claims = len(summary["claims"])
+    claims = len(summary.claims)
     good = f"; {claims} claim{'s' * (claims != 1)} held" if holds and claims else ""
     return (
         f'<div class="verdict{kind}"><b>{word}</b> — {escape(name)}{good}.'

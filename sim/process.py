@@ -12,19 +12,17 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Final
 
 from echelon.runner import Runner
 from echelon.session import Session
+from echelon.sim.contract import Body, ProcessSpec, StartError, finish, meet
 from echelon.sim.engine import make_role
-from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
+from echelon.sim.to_supervisor import Failed, Waiting
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
-Body = Callable[[ProcessSpec, Session, Connection], None]
-"""What a process does once it has its session."""
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
@@ -43,10 +41,10 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
             os.nice(10)  # it has time, others have not
         if spec.kind == "recorder":
             from echelon.sim.watchers import run_recorder as body
-        elif spec.kind == "referee":
-            from echelon.sim.wall_drives import run_wall_referee as body
-        elif spec.kind in ("bridge", "drives"):
-            body = _station_body(spec)
+        elif spec.kind in ("bridge", "drives", "referee"):
+            from echelon.sim.bus_processes import body_of
+
+            body = body_of(spec)
         else:
             body = _run_member
         with _open(spec) as session:
@@ -54,7 +52,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     except SystemExit:
         os._exit(0)
     except StartError as error:
-        control.send(("failed", str(error)))
+        control.send(Failed(str(error)))
         os._exit(1)
     except BaseException:
         traceback.print_exc()
@@ -74,25 +72,6 @@ def _open(spec: ProcessSpec) -> Session:
         raise StartError(str(error)) from None
 
 
-def _station_body(spec: ProcessSpec) -> Body:
-    """Returns what a process between robots and wheels does; each way needs modules of its own."""
-    if not spec.plan.stations:
-        from echelon.sim.watchers import run_bridge
-
-        return run_bridge
-    if spec.virtual:
-        from echelon.sim.stations import run_station
-
-        return run_station
-    if spec.kind == "bridge":
-        from echelon.sim.wall_bridge import run_wall_bridge
-
-        return run_wall_bridge
-    from echelon.sim.wall_drives import run_wall_drives
-
-    return run_wall_drives
-
-
 def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:
     runner = Runner(
         make_role(spec.plan, spec.index),
@@ -108,15 +87,13 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
     gc.disable()  # nothing in the loop makes cycles, and a pause of one role is a pause of all
     try:
         if spec.virtual:
-            runner.lockstep(lambda time_ns, sources: control.send(("waiting", time_ns, sources)))
+            runner.lockstep(lambda time_ns, sources: control.send(Waiting(time_ns, tuple(sources))))
         else:
             runner.wall_clock(start_ns)
     finally:
         runner.finish()  # what a run that breaks off has said so far is to be recorded
     signal.signal(signal.SIGTERM, _leave)
-    cpu_s, resident = resources()
-    control.send(("done", Result(spec.name, cpu_s, resident, runner.counts, tuple(runner.mailbox.counts()))))
-    control.recv()  # until everyone is done: a link that closes early would look like a death to its neighbours
+    finish(spec, control, runner.counts, runner.mailbox.counts())
 
 
 def _leave(number: int, frame: object) -> None:

@@ -3,10 +3,12 @@
 Every time in the file is the run's own, so the same run gives the same bytes.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from echelon.bridge.frame_message import TimedFrame
+from echelon.layout import NodeLayout, length
 from echelon.link import LinkCounts
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
@@ -65,7 +67,7 @@ class Recorder:
         source, channel = message.source, message.channel
         number, size, encode = self._routes[16 * source + channel]
         if len(raw) != size:
-            name = self._plan.everyone[source].name
+            name = self._plan.all_roles[source].name
             raise ValueError(f"{channel.name} of {name} has {len(raw) // 8} values; it must have {size // 8}")
         self._file.add(number, message.sequence, self._now, encode(self._head, raw))
         if channel is Channel.STATE:
@@ -79,9 +81,9 @@ class Recorder:
             self._file.add(self._numbers[self._frame_topics[bus]], self._frames[bus], time_ns, frame)
             self._frames[bus] += 1
 
-    def record_links(self, time_ns: int, links: list[LinkCounts]) -> None:
+    def record_links(self, time_ns: int, links: Sequence[LinkCounts]) -> None:
         """Takes the counts of links at an instant."""
-        members = self._plan.everyone
+        members = self._plan.all_roles
         for counts in links if self._file.failure is None else ():
             name = f"{members[counts.source].name} to {members[counts.receiver].name}"
             data = ros.link_statistics(time_ns, counts, name)
@@ -124,26 +126,24 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
         topics[topic] = f"echelon_msgs/{kind}"
         routes[16 * source + channel] = (topic, splice)
 
-    if plan.stations:
+    if plan.bridge is not None:
         for robot in plan.robots:
             add(Channel.TORQUE, robot.index, f"/{robot.path}/torque", "WheelTorque", ros.wheel_torque())
-        bridge = plan.stations[0]
-        add(Channel.WHEELS, bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
-    coupled, avoiding = plan.coupled, plan.avoidance.enabled
+        add(Channel.WHEELS, plan.bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
     for node in plan.nodes:
         prefix = f"/{node.path}/".replace("//", "/")
-        forces = 2 * node.robots if avoiding else 0
+        layout = NodeLayout.of(plan, node)
         if node.parent is not None:
-            encoder = ros.group_state(2 * (node.robots - 1) if coupled else 0, forces)
+            state = layout.state
+            encoder = ros.group_state(length(state.rates), length(state.positions))
             add(Channel.GROUP_STATE, node.index, prefix + "state", "GroupState", encoder)
-        children = 2 * len(node.children)
-        if any(child >= len(plan.robots) for child in node.children):
-            encoder = ros.reference(children, 2 * len(plan.robots) if coupled else 0, forces)
+        if (reference := layout.reference) is not None:
+            encoder = ros.reference(*map(length, (reference.accelerations, reference.rates, reference.forces)))
             add(Channel.REFERENCE, node.index, prefix + "reference", "Reference", encoder)
-        if any(child < len(plan.robots) for child in node.children):
-            add(Channel.COMMAND, node.index, prefix + "command", "Command", ros.command(children))
+        if (command := layout.command) is not None:
+            add(Channel.COMMAND, node.index, prefix + "command", "Command", ros.command(length(command.accelerations)))
     return topics, routes
 
 

@@ -28,7 +28,7 @@ from echelon.plan import Plan
 from echelon.sim import ros
 from echelon.sim.chunked import CHUNK_SIZE, MAGIC, METADATA
 from echelon.sim.recorder import LINKS, SCENARIO, state_topic
-from echelon.sim.trace import Trace
+from echelon.sim.results.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")

@@ -4,11 +4,9 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from echelon.sim.blocks import Blocks, block_series
 from echelon.sim.can_report import can_section
-from echelon.sim.distances import Distances, distances
 from echelon.sim.figures import (
     SMALL_MULTIPLES,
     errors,
@@ -30,8 +28,11 @@ from echelon.sim.page import (
     tiles,
     verdict,
 )
-from echelon.sim.summary import number
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import Blocks, block_series
+from echelon.sim.results.distances import Distances, distances
+from echelon.sim.results.records import Summary
+from echelon.sim.results.summary import number
+from echelon.sim.results.trace import Trace
 
 MAX_ROWS: Final = 60
 """Rows of a table on the page; the summary has them all."""
@@ -39,12 +40,12 @@ MAX_ROWS: Final = 60
 
 @dataclass(frozen=True, slots=True)
 class RunForReport:
-    """A run as the report takes it: its name, what was recorded, its summary (`sim.summary.summarise`), the effective
+    """A run as the report takes it: its name, what was recorded, its summary, the effective
     scenario as TOML, and the first frames on the bus, decoded: one mapping per frame, all with the same keys."""
 
     name: str
     trace: Trace
-    summary: Mapping[str, Any]
+    summary: Summary
     scenario: str
     frames: tuple[Mapping[str, object], ...] = ()
 
@@ -71,7 +72,7 @@ def write_report(runs: Sequence[RunForReport], path: Path) -> None:
         raise ValueError("a report needs at least one run")
     width = 5.6 if len(runs) > 1 else 11.5
     shown = [_Shown(run, block_series(run.trace), distances(run.trace), width, len(runs) > 1) for run in runs]
-    title = " · ".join(dict.fromkeys(str(run.summary["scenario"]) for run in runs))
+    title = " · ".join(dict.fromkeys(run.summary.scenario for run in runs))
     path.write_text(page(f"{title}: {', '.join(run.name for run in runs)}", _parts(title, shown)), encoding="utf-8")
 
 
@@ -109,7 +110,7 @@ def _description(scenario: str) -> str:
 
 def _facts(runs: Sequence[RunForReport]) -> list[str]:
     plan = runs[0].trace.plan
-    digests = [f"trace {str(run.summary['trace_digest'])[:12]}" for run in runs]
+    digests = [f"trace {run.summary.trace_digest[:12]}" for run in runs]
     return [
         f"{len(plan.robots)} robots",
         f"{len(plan.nodes)} nodes",
@@ -124,23 +125,22 @@ def _named(one: _Shown) -> str:
 
 def _tiles(one: _Shown) -> str:
     summary = one.run.summary
-    distance, torques, run = summary["distance"], summary["torque"], summary["run"]
-    peak = max((row["peak"] for row in torques if row["peak"] is not None), default=None)
-    values = [(f"{claim['block']} settled", number(claim["measured"], "s", "never")) for claim in summary["claims"]]
-    values += [("smallest distance", number(distance["smallest"], "m")), ("largest torque", _engineering(peak, "N m"))]
-    if "real_time_factor" in run:
-        values.append(("of real time", number(run["real_time_factor"], "×")))
+    peak = max((row.peak for row in summary.torque if row.peak is not None), default=None)
+    values = [(f"{claim.block} settled", number(claim.measured, "s", "never")) for claim in summary.claims]
+    values.append(("smallest distance", number(summary.distance.smallest, "m")))
+    values.append(("largest torque", _engineering(peak, "N m")))
+    values.append(("of real time", number(summary.run.real_time_factor, "×")))
     return tiles(values)
 
 
 def _claims(runs: Sequence[RunForReport]) -> str:
     rows: list[list[object]] = []
-    for at, claim in enumerate(runs[0].summary["claims"]):
-        row: list[object] = [f"{claim['block']} within {100 * claim['band']:g} %", number(claim["settled_by"], "s")]
+    for at, claim in enumerate(runs[0].summary.claims):
+        row: list[object] = [f"{claim.block} within {100 * claim.band:g} %", number(claim.settled_by, "s")]
         for run in runs:
-            others = run.summary["claims"]
-            same = at < len(others) and others[at]["block"] == claim["block"]
-            row += [number(others[at]["measured"], "s", "never"), others[at]["holds"]] if same else [None, None]
+            others = run.summary.claims
+            same = at < len(others) and others[at].block == claim.block
+            row += [number(others[at].measured, "s", "never"), others[at].holds] if same else [None, None]
         rows.append(row)
     if not rows:
         return paragraph("The scenario makes no claims.")
@@ -150,20 +150,20 @@ def _claims(runs: Sequence[RunForReport]) -> str:
 
 def _separation(one: _Shown) -> str:
     head = ["slower over faster", "σ ratio", "settling ratio, 5 %", "2 %"]
-    keys = ("sigma_ratio", "settling_5_ratio", "settling_2_ratio")
-    rows = [
-        [f"{row['slower']} over {row['faster']}", *(row[key] for key in keys)] for row in one.run.summary["separation"]
+    rows: list[list[object]] = [
+        [f"{row.slower} over {row.faster}", row.sigma_ratio, row.settling_5_ratio, row.settling_2_ratio]
+        for row in one.run.summary.separation
     ]
     return table(head, rows) if rows else ""
 
 
 def _trajectories(one: _Shown) -> str:
-    plan, distance = one.run.trace.plan, one.run.summary["distance"]
+    plan, distance = one.run.trace.plan, one.run.summary.distance
     number_of_figure, how = ("3", "with") if plan.avoidance.enabled else ("2", "without")
     what = f"Paths of the {len(plan.robots)} robots {how} avoidance"
     return figure(
         trajectories(one.run.trace, one.width),
-        f"{what}; smallest distance {number(distance['smallest'], 'm')}.",
+        f"{what}; smallest distance {number(distance.smallest, 'm')}.",
         f"{what} (the paper's Fig. {number_of_figure}). Open triangles: start; filled: end, pointing in heading "
         "direction; tinted: each group's final shape. Dashed: desired centroid; black: its real path.",
     )
@@ -179,7 +179,7 @@ def _transformed(one: _Shown) -> str:
 
 
 def _errors(one: _Shown) -> str:
-    settled = ", ".join(f"{row['name']} {number(row['settling_5'], 's', 'never')}" for row in one.run.summary["blocks"])
+    settled = ", ".join(f"{row.name} {number(row.settling_5, 's', 'never')}" for row in one.run.summary.blocks)
     return figure(
         errors(one.blocks, one.run.trace.plan, one.width),
         f"Error norm of every block over time, both axes logarithmic. Settled to 5 %: {settled}.",
@@ -190,29 +190,27 @@ def _errors(one: _Shown) -> str:
 def _blocks(one: _Shown) -> str:
     head = ["block", "σ [s]", "5 %", "2 %", "peak", "residual", "ISE", "IAE", "ITAE"]
     keys = ("name", "sigma", "settling_5", "settling_2", "peak_error", "residual", "ise", "iae", "itae")
-    return table(head, [[row[key] for key in keys] for row in one.run.summary["blocks"]])
+    return table(head, [[getattr(row, key) for key in keys] for row in one.run.summary.blocks])
 
 
 def _distances(one: _Shown) -> str:
-    distance = one.run.summary["distance"]
-    violations = distance["violations"]
+    distance = one.run.summary.distance
+    violations = distance.violations
     drawn = figure(
         smallest_distance(one.near, one.run.trace.plan, one.width),
-        f"Smallest distance between robots over time; the smallest is {number(distance['smallest'], 'm')}.",
+        f"Smallest distance between robots over time; the smallest is {number(distance.smallest, 'm')}.",
         "Smallest distance of all pairs; between recorded instants robots are taken to move straight. Circle: the "
         "closest encounter. Tinted: closer than the avoidance radius rₐ. Rₛ: sensing radius."
         + (
             ""
-            if distance["avoidance_enabled"]
+            if distance.avoidance_enabled
             else " Avoidance is not enabled: violations are reported, but fail nothing."
         ),
     )
     if not violations:
         return drawn + paragraph("No pair came within the avoidance radius.")
-    shown = sorted(violations, key=lambda row: float(row["smallest"]))[:MAX_ROWS]
-    rows = [
-        [" – ".join(row["pair"]), *(f"{row[key]:.6f}" for key in ("first", "last")), row["smallest"]] for row in shown
-    ]
+    shown = sorted(violations, key=lambda row: row.smallest)[:MAX_ROWS]
+    rows = [[" – ".join(row.pair), f"{row.first:.6f}", f"{row.last:.6f}", row.smallest] for row in shown]
     return drawn + table(["violation", "from [s]", "to [s]", "smallest [m]"], rows) + _rest(len(violations))
 
 
@@ -220,11 +218,10 @@ def _torques(one: _Shown) -> str:
     count = len(one.run.trace.plan.robots)
     which = f"; the {SMALL_MULTIPLES} robots with the largest" if count > SMALL_MULTIPLES else ""
     rows = []
-    for row in one.run.summary["torque"][:MAX_ROWS]:
-        share = row["saturation_share"]
-        values = [_engineering(row[key]) for key in ("rms", "peak")]
-        saturated = "–" if share is None else f"{100 * share:.3g}"
-        rows.append([row["robot"], *values, number(row["peak_time"]), saturated, row["saturated_after_first_second"]])
+    for row in one.run.summary.torque[:MAX_ROWS]:
+        values = [_engineering(row.rms), _engineering(row.peak), number(row.peak_time)]
+        saturated = "–" if row.saturation_share is None else f"{100 * row.saturation_share:.3g}"
+        rows.append([row.robot, *values, saturated, row.saturated_after_first_second])
     drawn = figure(
         wheel_torques(one.run.trace, one.width),
         "Wheel torques of every robot over time.",
@@ -236,18 +233,18 @@ def _torques(one: _Shown) -> str:
 
 
 def _can(one: _Shown) -> str:
-    return can_section(one.run.summary["can"], one.run.frames)
+    return can_section(one.run.summary.can, one.run.frames)
 
 
 def _links(one: _Shown) -> str:
-    links = one.run.summary["links"]
+    links = one.run.summary.links
     head = ["link", "channel", "sent", "lost", "in flight", "held", "mean age", "largest"]
     rows = [
         [
-            f"{row['source']} → {row['receiver']}",
-            row["channel"].replace("_", " "),
-            *(row[key] for key in ("sent", "lost", "in_flight", "held")),
-            *(f"{row[key]:.4g}" for key in ("age_mean", "age_max")),
+            f"{row.source} → {row.receiver}",
+            row.channel.replace("_", " "),
+            *(row.sent, row.lost, row.in_flight, row.held),
+            *(f"{row.age_mean:.4g}", f"{row.age_max:.4g}"),
         ]
         for row in links[:MAX_ROWS]
     ]

@@ -3,28 +3,36 @@
 The folder holds `scenario.toml` (effective), `run.mcap`, `can.log`, `torque.dbc`, `summary.json` and `report.html`.
 """
 
+import os
 import platform
 import resource
+import shlex
+import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from echelon.bridge.frame_message import frames_of
+from echelon import __version__
+from echelon.bridge.reports import RefereeReport
+from echelon.bridge.stations.bridge import open_bridge
+from echelon.bridge.stations.closed import LOG
 from echelon.load import effective_toml
-from echelon.messages import Channel
+from echelon.messages import Message
 from echelon.plan import Plan
 from echelon.scenario import Scenario
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display
-from echelon.sim.merge import TimeOrder
-from echelon.sim.summary import summarise, write
+from echelon.sim.results.records import ProcessResult, RunFacts, Summary
+from echelon.sim.results.rendering import write_summary
+from echelon.sim.results.summary import summarise
+from echelon.sim.results.trace import Trace
 from echelon.sim.supervisor import Outcome, Progress, Supervisor
-from echelon.sim.trace import Trace
-from echelon.sim.watchers import Recording
+from echelon.sim.time_order import TimeOrder, speakers
+from echelon.sim.watchers import RunRecorder
 
 PARTS: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
@@ -34,12 +42,16 @@ FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque*.dbc", "summary.
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A finished run: its folder, its summary, and `failure` if it broke off."""
+    """A finished run: its folder, its summary, and its trace."""
 
     folder: Path
-    summary: dict[str, Any]
+    summary: Summary
     trace: Trace
-    failure: str | None
+
+    @property
+    def failure(self) -> str | None:
+        """Why it broke off, if it did."""
+        return self.summary.run.failure
 
 
 def new_folder(scenario: Scenario, out: Path | None) -> Path:
@@ -72,6 +84,7 @@ def execute(
 ) -> Finished:
     """Runs a plan and writes the run's folder, except for the report.  Raises OSError if a file cannot be written, and
     ValueError too if, in one process, the bus cannot be had."""
+    begun = datetime.now(UTC)
     toml = effective_toml(scenario)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
     metadata = {
@@ -95,24 +108,20 @@ def execute(
             show=display.show,
             stall_timeout_s=stall_timeout_s,
         ).run()
-    if outcome.can and "referee" not in outcome.can:
-        outcome.can["referee"] = judged(folder / "can.log", plan, clock, whole=not outcome.failure)
+    can = outcome.can
+    if can is not None and can.referee is None:
+        can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not outcome.failure))
     display.close()
-    summary = summarise(outcome.trace, outcome.links, outcome.can, _run_facts(plan, outcome, engine, clock))
-    if outcome.failure:
-        verdict = summary["verdict"]
-        verdict["holds"] = False
-        verdict["reasons"].insert(0, outcome.failure.splitlines()[0])
-    write(summary, folder / "summary.json")
-    return Finished(folder, summary, outcome.trace, outcome.failure)
+    summary = summarise(outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun))
+    write_summary(summary, folder / "summary.json")
+    return Finished(folder, summary, outcome.trace)
 
 
-def judged(log: Path, plan: Plan, clock: str, whole: bool) -> dict[str, Any]:
+def judged(log: Path, plan: Plan, clock: str, whole: bool) -> RefereeReport:
     """Returns what the referee finds in a run's can.log."""
     from echelon.bridge.referee import judge_log
 
-    tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
-    return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole) | {"source": "can.log"}
+    return judge_log(log, plan, tolerance_ns=plan.can.watchdog_ns // 2 if clock == "wall" else None, whole=whole)
 
 
 def _in_process(
@@ -125,35 +134,17 @@ def _in_process(
     display: Display,
 ) -> Outcome:
     """The in-process engine with recorder and bridge beside it, in the same order of messages as between processes."""
-    recording = Recording(folder, plan, toml, metadata)
-    gathered: list[Any] = []
+    recording = RunRecorder(folder, plan, toml, metadata)
+    gathered: list[Message] = []
     engine = Engine(plan, gathered.append)
-    station: Any = None
-    if plan.stations:
-        from echelon.bridge.closed import ClosedStation
-        from echelon.bridge.commander import Commander
-
-        commander = engine.roles[plan.stations[0].index]
-        assert isinstance(commander, Commander)
-        station = ClosedStation(plan, can_urls, folder, paired=False, role=commander)
-    elif can_urls:
-        from echelon.bridge.station import Station
-
-        station = Station(plan, can_urls, folder)
-    order = TimeOrder(range(len(plan.everyone) if plan.stations else len(plan.members) + bool(can_urls)))
-    progress = Progress(phase="running", started_s=time.monotonic())
-    if station is not None:
-        progress.can["url"] = station.url
+    bridge = open_bridge(plan, can_urls, folder, engine.commander)
+    order = TimeOrder(speakers(plan, True, bool(can_urls)))
+    progress = Progress(phase="running", started_s=time.monotonic(), bridge=bridge.progress())
     begun_s = shown_s = time.monotonic()
     failure: str | None = None
 
     def pass_on() -> None:
-        if plan.stations:
-            for message in gathered:
-                if message.channel is Channel.FRAMES and message.source == station.index:
-                    station.show(frames_of(message))
-        elif station is not None:
-            gathered.extend(station.put(gathered))  # robots speak in their order, instant by instant
+        gathered.extend(bridge.take(gathered))  # robots speak in their order, instant by instant
         recording.add(order.push(gathered))
         gathered.clear()
 
@@ -168,7 +159,8 @@ def _in_process(
             now_s = time.monotonic()
             if now_s - shown_s >= 0.2:
                 shown_s = now_s
-                _note(progress, recording, station)
+                progress.hear(recording.progress())
+                progress.bridge = bridge.progress()
                 recording.recorder.flush_if_due(time.monotonic_ns())
                 display.show(progress)
             if recording.recorder.failure:
@@ -176,8 +168,7 @@ def _in_process(
                 break
     except KeyboardInterrupt:
         failure = "interrupted"
-        if plan.stations:
-            station.rail.stopping.set()  # a bus that takes no frames is not waited for any more
+        bridge.interrupt()
     wall_s = time.monotonic() - begun_s
     try:
         pass_on()
@@ -186,77 +177,52 @@ def _in_process(
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
-    if plan.stations:
-        station.stop_wheels(station.role.next_ns)
-    if station is not None:
-        station.close()
-    result = recording.result()
-    failure = failure or (f"the recording failed: {result['failure']}" if result["failure"] else None)
+    bridge.stop()
+    bridge.close()
+    recorded = recording.report()
+    failure = failure or (f"the recording failed: {recorded.failure}" if recorded.failure else None)
+    can = bridge.report()
+    if can is not None and engine.drives is not None:
+        can = can.with_drives(engine.drives.report())
     return Outcome(
-        trace=result["trace"],
+        trace=recorded.trace,
         links=links,
-        results=[],
-        can=_can_result(engine, station),
+        processes=[],
+        can=can,
         startup_s=0.0,
         wall_s=wall_s,
-        messages=result["messages"],
+        messages=recorded.messages,
         failure=failure,
     )
 
 
-def _can_result(engine: Engine, station: Any) -> dict[str, Any]:
-    if station is None:
-        return {}
-    result: dict[str, Any] = station.result()
-    if engine.plan.stations[1:]:
-        from echelon.bridge.buses import merge_rows
-        from echelon.bridge.drive_bank import DriveBank
-
-        drives = engine.roles[engine.plan.stations[1].index]
-        assert isinstance(drives, DriveBank)
-        result["drives"] = drives.result()
-        merge_rows(result["buses"], drives.lost_rows())
-    return result
-
-
-def _note(progress: Progress, recording: Any, station: Any) -> None:
-    news = recording.progress()
-    progress.time_ns, progress.messages = news["time_ns"], news["messages"]
-    progress.states, progress.states_ns = news["states"], news["states_ns"]
-    if station is not None:
-        progress.can.update(station.progress())
-
-
-def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str) -> dict[str, Any]:
+def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: datetime) -> RunFacts:
     common_ns, _ = outcome.trace.common()
     # Robots move on through the period that begins at the last instant: so much was simulated.
     simulated_s = (int(common_ns[-1]) + plan.robots[0].period_ns) / 1e9 if len(common_ns) else 0.0
-    facts: dict[str, Any] = {
-        "engine": engine,
-        "clock": clock,
-        "wall_time": outcome.wall_s,
-        "startup_time": outcome.startup_s,
-        "real_time_factor": simulated_s / outcome.wall_s if outcome.wall_s > 0 else None,
-        "ticks_per_second": simulated_s * 1e9 / plan.robots[0].period_ns / outcome.wall_s
-        if outcome.wall_s > 0
-        else None,
-        "messages": outcome.messages,
-        "failure": outcome.failure,
-    }
-    runners = [result.runner for result in outcome.results if result.runner is not None]
-    if runners:
-        robots = {robot.name for robot in plan.robots}
-        facts["processes"] = {
-            result.name: {"cpu_time": result.cpu_s, "resident_bytes": result.resident_bytes}
-            for result in outcome.results
-        }
-        facts["resident_bytes_robot_max"] = max(
-            (result.resident_bytes for result in outcome.results if result.name in robots), default=None
-        )
-        facts["late_stages"] = sum(runner.late for runner in runners)
-        facts["stages"] = sum(runner.stages for runner in runners)
-        facts["latest"] = max(runner.latest_ns for runner in runners) / 1e9
-        facts["refused"] = sum(sum(runner.refused.values()) for runner in runners)
-    else:
-        facts["resident_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return facts
+    factor = simulated_s / outcome.wall_s if outcome.wall_s > 0 else None
+    runners = [process.runner for process in outcome.processes if process.runner is not None]
+    robots = {robot.name for robot in plan.robots}
+    of_robots = [process.resident_bytes for process in outcome.processes if process.name in robots]
+    return RunFacts(
+        engine=engine,
+        clock=clock,
+        wall_time=outcome.wall_s,
+        startup_time=outcome.startup_s,
+        real_time_factor=factor,
+        ticks_per_second=None if factor is None else factor * 1e9 / plan.robots[0].period_ns,
+        messages=outcome.messages,
+        failure=outcome.failure,
+        date=begun.isoformat(timespec="seconds"),
+        version=__version__,
+        machine=f"{platform.platform()}, {platform.processor() or platform.machine()}, {os.cpu_count()} cores",
+        python=platform.python_version(),
+        command=shlex.join(sys.argv),
+        late_stages=sum(runner.late for runner in runners),
+        stages=sum(runner.stages for runner in runners),
+        latest=max((runner.latest_ns for runner in runners), default=0) / 1e9,
+        refused=sum(sum(runner.refused.values()) for runner in runners),
+        resident_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 if engine == "inprocess" else None,
+        resident_bytes_robot_max=max(of_robots, default=None),
+        processes={process.name: ProcessResult(process.cpu_s, process.resident_bytes) for process in outcome.processes},
+    )

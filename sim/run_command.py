@@ -1,7 +1,6 @@
 """`echelon run`: from what the user typed to a run, its folder, and the exit code."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,8 +18,9 @@ def run(arguments: argparse.Namespace) -> int:
     scenario, plan = scenario_of(arguments)
     from echelon.sim.bus_urls import bus_urls, check_wall_clock
     from echelon.sim.live import Display
+    from echelon.sim.results.rendering import json_text
+    from echelon.sim.results.summary import summary_text
     from echelon.sim.run import execute, new_folder
-    from echelon.sim.summary import summary_text
 
     can_urls = bus_urls(plan, arguments.can, arguments.engine == "inprocess")
     if arguments.clock == "wall" and plan.can.closed and (not can_urls or arguments.engine == "inprocess"):
@@ -67,14 +67,14 @@ def run(arguments: argparse.Namespace) -> int:
         except (UsageError, OSError) as error:  # of a run that broke off there may be nothing to report
             failure = failure or f"no report: {error}"
     if arguments.json:
-        print(json.dumps(finished.summary, indent=2, allow_nan=False))
+        print(json_text(finished.summary))
     else:
         print(summary_text(finished.summary))
         print(f"  folder   {folder}")
     if failure:
         print(f"echelon: {failure}", file=sys.stderr)
         return 3
-    return 0 if finished.summary["verdict"]["holds"] else 1
+    return 0 if finished.summary.verdict.holds else 1
 
 
 def _heading(plan: Plan, arguments: argparse.Namespace, folder: Path, can_urls: Sequence[str]) -> str:

@@ -1,6 +1,5 @@
 """Reads back the folder of a run, for reports and exports."""
 
-import json
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +13,7 @@ from echelon.plan import Plan
 from echelon.sim.parts import parse
 from echelon.sim.recording import read_trace
 from echelon.sim.report import RunForReport, write_report
+from echelon.sim.results.rendering import read_summary
 from echelon.sim.usage import UsageError
 
 FRAMES: Final = 18
@@ -24,7 +24,7 @@ def read_run(folder: Path) -> RunForReport:
     """Reads a run's folder.  Raises UsageError."""
     try:
         toml = (folder / "scenario.toml").read_text(encoding="utf-8")
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_summary(folder / "summary.json")
         _, plan = parse(toml, str(folder / "scenario.toml"), (), folder)
         trace = read_trace(folder / "run.mcap", plan)
     except OSError as error:

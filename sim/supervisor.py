@@ -8,17 +8,19 @@ They talk over the loopback, at an address and ports of this run's own.
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final
 
-from echelon.bridge.buses import merge_rows
+from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
 from echelon.link import LinkCounts
 from echelon.plan import Plan
 from echelon.sim.children import FINISHING, Child, list_specs, start
-from echelon.sim.joining import ProcessSpec, Result
-from echelon.sim.trace import Trace, TraceBuilder
+from echelon.sim.contract import ProcessSpec
+from echelon.sim.results.trace import Array, Trace, TraceBuilder
+from echelon.sim.to_process import End, Finish, Start, Told
+from echelon.sim.to_supervisor import Done, Failed, Ready, RecorderProgress, RecorderReport, Said, Waiting
 
 START_TIMEOUT_S: Final = 30.0
 STALL_REPORT_S: Final = 3.0
@@ -38,12 +40,18 @@ class Progress:
     phase: str = "starting"
     time_ns: int = 0
     states_ns: int = 0
-    states: Any = None
+    states: Array | None = None
     messages: int = 0
     started_s: float = 0.0
-    can: dict[str, Any] = field(default_factory=dict)
+    bridge: BridgeProgress = field(default_factory=BridgeProgress)
+    drives: BridgeProgress = field(default_factory=BridgeProgress)
     note: str = ""
     """Something to tell at once, e.g. whom everyone waits for"""
+
+    def hear(self, recorder: RecorderProgress) -> None:
+        """Takes over how far the recorder is."""
+        self.time_ns, self.messages = recorder.time_ns, recorder.messages
+        self.states, self.states_ns = recorder.states, recorder.states_ns
 
 
 @dataclass(slots=True)
@@ -52,8 +60,8 @@ class Outcome:
 
     trace: Trace
     links: list[LinkCounts]
-    results: list[Result]
-    can: dict[str, Any]
+    processes: list[Done]
+    can: CanReport | None
     startup_s: float
     wall_s: float
     messages: int
@@ -104,12 +112,12 @@ class Supervisor:
             self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
             startup_s = time.monotonic() - begun_s
             start_s = time.monotonic() + (0.0 if self.virtual else self._lead_in_s())
-            self._tell_all(("start", round(start_s * 1e9)))
+            self._tell_all(Start(round(start_s * 1e9)))
             self.progress.phase, self.progress.started_s = "running", start_s
             self._moved_s = time.monotonic()
             members = [child for child in self._children if child.is_member]
             limit_s = None if self.virtual else self.plan.duration_ns / 1e9 + 10.0
-            self._until(lambda: all(child.result for child in members), limit_s, "not done")
+            self._until(lambda: all(child.done for child in members), limit_s, "not done")
             wall_s = time.monotonic() - start_s
             self.progress.phase = "finishing"
         except RunError as error:
@@ -132,7 +140,7 @@ class Supervisor:
 
     def _lead_in_s(self) -> float:
         """Returns how long after the barrier run time 0 is on a wall clock: drives are brought up until then."""
-        return max(WALL_START_S, self.plan.can.bring_up_ns / 1e9 if self.plan.stations else 0.0)
+        return max(WALL_START_S, self.plan.can.bring_up_ns / 1e9 if self.plan.can.closed else 0.0)
 
     def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
         """Serves the children until `done`.  Raises RunError if one is lost, the run stalls, or the time is up."""
@@ -148,7 +156,7 @@ class Supervisor:
                 self._show(self.progress)
             if deadline_s is not None and now_s > deadline_s:
                 late = [
-                    child.name for child in self._children if not (child.ready if what == "not ready" else child.result)
+                    child.name for child in self._children if not (child.ready if what == "not ready" else child.done)
                 ]
                 raise RunError(f"{what} after {timeout_s:g} s: {', '.join(late)}{self._words_of(late)}")
 
@@ -160,7 +168,7 @@ class Supervisor:
                 by_handle[child.control] = child
             if not child.words.closed:
                 by_handle[child.words] = child
-        sentinels = [child.process.sentinel for child in self._children if child.result is None]
+        sentinels = [child.process.sentinel for child in self._children if child.done is None]
         for handle in wait([*by_handle, *sentinels], timeout_s):
             if isinstance(handle, Connection):
                 child = by_handle[handle]
@@ -171,38 +179,36 @@ class Supervisor:
 
     def _hear(self, child: Child) -> None:
         try:
-            kind, *rest = child.control.recv()
+            said: Said = child.control.recv()
         except (EOFError, OSError):
             child.control.close()
             return
         child.heard_s = time.monotonic()
         progress = self.progress
-        match kind:
-            case "ready":
+        match said:
+            case Ready():
                 child.ready = True
-            case "waiting":
-                child.waiting_ns, child.waiting_for = rest
-            case "bus":
-                progress.can["url"] = rest[0]
-            case "progress" if child.spec.kind == "recorder":
-                news = rest[0]
-                progress.time_ns, progress.messages = news["time_ns"], news["messages"]
-                progress.states, progress.states_ns = news["states"], news["states_ns"]
-                if news["failure"] and progress.phase == "running":
-                    raise RunError(f"the recording failed: {news['failure']}")
-            case "progress":
-                progress.can.update(rest[0])
-            case "failed":
-                raise RunError(f"{child.spec.kind} {child.name} cannot start: {rest[0]}")
-            case "done":
-                child.result = rest[0]
+            case Waiting():
+                child.waiting_ns, child.waiting_for = said.time_ns, list(said.sources)
+            case BridgeProgress() if child.spec.kind == "bridge":
+                progress.bridge = said
+            case BridgeProgress():
+                progress.drives = said
+            case RecorderProgress():
+                progress.hear(said)
+                if said.failure and progress.phase == "running":
+                    raise RunError(f"the recording failed: {said.failure}")
+            case Failed():
+                raise RunError(f"{child.spec.kind} {child.name} cannot start: {said.text}")
+            case Done():
+                child.done = said
 
     def _check_lost(self) -> None:
         for child in self._children:
-            if child.result is None and not child.process.is_alive():
+            if child.done is None and not child.process.is_alive():
                 while not child.control.closed and child.control.poll():
                     self._hear(child)
-                if child.result is None:
+                if child.done is None:
                     if not child.words.closed:
                         child.hear_words()
                     raise RunError(
@@ -243,13 +249,13 @@ class Supervisor:
             silent = [
                 child
                 for child in self._children
-                if child.is_member and child.result is None and now_s - child.heard_s > 2
+                if child.is_member and child.done is None and now_s - child.heard_s > 2
             ]
         if silent:
             return "everyone waits for " + ", ".join(
                 f"{child.name} (process {child.process.pid}, {child.state()})" for child in silent
             )
-        members = self.plan.everyone
+        members = self.plan.all_roles
         waits = [
             f"{child.name} for {', '.join(members[source].name for source in child.waiting_for)}"
             for child in self._children
@@ -266,23 +272,23 @@ class Supervisor:
         deadline_s = time.monotonic() + GRACE_S
         # Bridge and drives tell what they counted before they go, and must be listened to.
         while time.monotonic() < deadline_s and any(
-            child.process.is_alive() and child.result is None for child in members
+            child.process.is_alive() and child.done is None for child in members
         ):
             try:
                 self._serve(0.05)
             except RunError:
                 pass  # why the run broke off is known already
         for child in members:
-            if child.process.is_alive() and child.result is None:
+            if child.process.is_alive() and child.done is None:
                 child.process.kill()
 
     def _finish_watchers(self, failure: str | None) -> str | None:
         """Lets bridge, drives and recorder finish, in this order; returns the failure, if there is one by now."""
-        links = [counts for child in self._children if child.result for counts in child.result.links]
+        links = [counts for child in self._children if child.done for counts in child.done.links]
         sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
         for child in self._children:
-            if child.result and child.result.runner:
-                sent[child.spec.kind] += child.result.runner.messages
+            if child.done and child.done.runner:
+                sent[child.spec.kind] += child.done.runner.messages
         for kind in FINISHING:
             for child in self._children:
                 if (
@@ -294,37 +300,38 @@ class Supervisor:
                 ):
                     continue
                 whole = failure is None and self.virtual  # on a wall clock, messages may be lost on the way
-                order = {
-                    "links": links,
-                    "robot_messages": sent["robot"] if whole else None,
-                    "expected": sum(sent.values()) if whole else None,
-                }
+                order = Finish(
+                    links=tuple(links),
+                    robot_messages=sent["robot"] if whole else None,
+                    messages=sum(sent.values()) if whole else None,
+                )
                 try:
-                    child.control.send(("finish", order))
+                    child.control.send(order)
                     begun_s = time.monotonic()
                     patience_s = GRACE_S if failure else FINISH_TIMEOUT_S
-                    while child.result is None and child.process.is_alive() and time.monotonic() - begun_s < patience_s:
+                    while child.done is None and child.process.is_alive() and time.monotonic() - begun_s < patience_s:
                         self._serve(0.05)
                         if not failure and time.monotonic() - begun_s > STALL_REPORT_S:
                             self.progress.note = f"waits for {child.name} to finish ({child.state()})"
                             self._show(self.progress)
                 except (RunError, OSError) as error:
                     failure = failure or str(error)
-                if child.result is not None and kind == "bridge":
-                    sent["bridge"] = child.result.extra.get("messages", 0)
-                if child.result is None:
+                if child.done is not None and isinstance(child.done.report, CanReport):
+                    sent["bridge"] = child.done.report.messages
+                if child.done is None:
                     failure = failure or f"lost {kind} ({child.ending()}){self._words_of([child.name])}"
         for child in self._children:
-            if child.spec.kind == "recorder" and child.result and child.result.extra["failure"]:
-                failure = failure or f"the recording failed: {child.result.extra['failure']}"
+            report = child.done and child.done.report
+            if isinstance(report, RecorderReport) and report.failure:
+                failure = failure or f"the recording failed: {report.failure}"
         return failure
 
     def _take_down(self) -> None:
         """Ends all processes: those that are done by word, the others by signal."""
         for child in self._children:
-            if child.result is not None and not child.control.closed:
+            if child.done is not None and not child.control.closed:
                 try:
-                    child.control.send(("end",))
+                    child.control.send(End())
                 except OSError:
                     pass
             elif child.process.is_alive():
@@ -339,28 +346,35 @@ class Supervisor:
             child.words.close()
 
     def _outcome(self, failure: str | None, startup_s: float, wall_s: float) -> Outcome:
-        results = [child.result for child in self._children if child.result is not None]
-        extra: dict[str, dict[str, Any]] = {
-            child.spec.kind: child.result.extra
-            for child in self._children
-            if child.result is not None and child.result.extra
-        }
-        recorded = extra.get("recorder", {})
-        known = extra.get("drives", {}).pop("buses", [])
-        if known and "bridge" in extra:
-            merge_rows(extra["bridge"]["buses"], known)
+        processes = [child.done for child in self._children if child.done is not None]
+        can: CanReport | None = None
+        drives: DrivesReport | None = None
+        referee: RefereeReport | None = None
+        recorder: RecorderReport | None = None
+        for process in processes:
+            match process.report:
+                case CanReport():
+                    can = process.report
+                case DrivesReport():
+                    drives = process.report
+                case RefereeReport():
+                    referee = process.report
+                case RecorderReport():
+                    recorder = process.report
+        if can is not None:
+            can = replace(can if drives is None else can.with_drives(drives), referee=referee)
         return Outcome(
-            trace=recorded.get("trace") or TraceBuilder(self.plan).build(),
-            links=[counts for result in results for counts in result.links],
-            results=results,
-            can=extra.get("bridge", {}) | {kind: extra[kind] for kind in ("drives", "referee") if kind in extra},
+            trace=TraceBuilder(self.plan).build() if recorder is None else recorder.trace,
+            links=[counts for process in processes for counts in process.links],
+            processes=processes,
+            can=can,
             startup_s=startup_s,
             wall_s=wall_s,
-            messages=recorded.get("messages", 0),
+            messages=0 if recorder is None else recorder.messages,
             failure=failure,
         )
 
-    def _tell_all(self, message: tuple[Any, ...]) -> None:
+    def _tell_all(self, message: Told) -> None:
         for child in self._children:
             try:
                 child.control.send(message)

@@ -1,25 +1,27 @@
-"""The processes that watch a run: the recorder, and the bridge that puts torques on the CAN bus.
+"""Those who watch a run, and the first of them, the recorder.
 
-Both receive members' messages in batches and put them into one order of time first.  In virtual time a watcher that is
+They receive members' messages in batches and put them into one order of time first.  In virtual time a watcher that is
 slow slows the run; on a wall clock it loses, and says so.
 """
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from echelon.bridge.frame_message import unpack
 from echelon.layout import said_by
+from echelon.link import LinkCounts
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.session import Inbox, Session
-from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
-from echelon.sim.merge import TimeOrder
+from echelon.sim.contract import ProcessSpec, StartError, finish, hear_finish, meet
 from echelon.sim.recorder import Recorder
-from echelon.sim.trace import TraceBuilder
-from echelon.wire import WireError, count_refusal, decode, encode, join, split, watch_key
+from echelon.sim.results.trace import TraceBuilder
+from echelon.sim.time_order import TimeOrder, speakers
+from echelon.sim.to_supervisor import RecorderProgress, RecorderReport
+from echelon.wire import WireError, count_refusal, decode, split, watch_key
 
 PROGRESS_S: Final = 0.2
 SLACK_NS: Final = 60_000_000_000
@@ -84,12 +86,10 @@ class Reception:
 def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
     plan = spec.plan
-    # The bridge's messages come after the members'; drives say something of their own only where time is virtual.
-    stations = len(plan.stations) if spec.virtual else 1
-    sources = range(len(plan.members) + (stations if plan.stations else bool(spec.can_urls)))
+    sources = speakers(plan, spec.virtual, bool(spec.can_urls))
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
     try:
-        recording = Recording(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
+        recording = RunRecorder(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
     except OSError as error:
         raise StartError(f"{error.filename}: {error.strerror}") from None
     meet(spec, session, control)
@@ -100,20 +100,16 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
         if now_s - said_s >= PROGRESS_S:
             said_s = now_s
             recording.recorder.flush_if_due(time.monotonic_ns())
-            control.send(("progress", recording.progress()))
-        if control.poll():
-            _, finish = control.recv()
+            control.send(recording.progress())
+        if (order := hear_finish(control)) is not None:
             break
-    for messages in reception.drain(finish["expected"]):
+    for messages in reception.drain(order.messages):
         recording.add(messages)
-    recording.close(finish["links"])
-    cpu_s, resident = resources()
-    extra = recording.result() | {"refused": reception.refused_count}
-    control.send(("done", Result(spec.name, cpu_s, resident, extra=extra)))
-    control.recv()
+    recording.close(order.links)
+    finish(spec, control, report=recording.report(reception.refused_count))
 
 
-class Recording:
+class RunRecorder:
     """Where a run's messages go once they are in order: run.mcap and the trace."""
 
     def __init__(self, folder: Path, plan: Plan, scenario_toml: str, metadata: dict[str, str]) -> None:
@@ -121,9 +117,9 @@ class Recording:
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self._time_ns = 0
-        self._bridge = len(plan.members)
+        self._bridge = len(plan.formation)
 
-    def add(self, messages: list[Message]) -> None:
+    def add(self, messages: Sequence[Message]) -> None:
         """Takes messages in order of time."""
         recorder, trace = self.recorder, self._trace
         for message in messages:
@@ -138,61 +134,16 @@ class Recording:
         if messages:
             self._time_ns = messages[-1].time_ns
 
-    def progress(self) -> dict[str, Any]:
-        """Returns what a live table shows: run time, robots' last states, messages, a failure if there is one."""
-        last = self._trace.last()
-        return {
-            "time_ns": self._time_ns,
-            "states": None if last is None else last[1],
-            "states_ns": 0 if last is None else last[0],
-            "messages": self.messages,
-            "failure": self.recorder.failure,
-        }
+    def progress(self) -> RecorderProgress:
+        """Returns how far the recording is."""
+        states_ns, states = self._trace.last() or (0, None)
+        return RecorderProgress(self._time_ns, self.messages, states_ns, states, self.recorder.failure)
 
-    def close(self, links: list[Any]) -> None:
+    def close(self, links: Sequence[LinkCounts]) -> None:
         """Writes the links' counts and ends the recording."""
         self.recorder.record_links(self._time_ns, links)
         self.recorder.close()
 
-    def result(self) -> dict[str, Any]:
-        """Returns the trace, and what became of the recording."""
-        return {"trace": self._trace.build(), "failure": self.recorder.failure, "messages": self.messages}
-
-
-def run_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The bridge process: robots' torques to frames, on the bus, in can.log, and to the recorder."""
-    from echelon.bridge.station import Station  # python-can and cantools, for this process alone
-
-    plan = spec.plan
-    robots = [robot.index for robot in plan.robots]
-    reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots, plan)
-    publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
-    try:
-        station = Station(plan, spec.can_urls, Path(spec.folder))
-    except (ValueError, OSError) as error:
-        raise StartError(str(error)) from None
-    control.send(("bus", station.url))
-    meet(spec, session, control)
-
-    def put(messages: list[Message]) -> None:
-        frames = [encode(message) for message in station.put(messages)]
-        for at in range(0, len(frames), 16):
-            publisher.put(join(frames[at : at + 16]))
-
-    said_s = time.monotonic()
-    while True:
-        put(reception.take(PROGRESS_S / 2))
-        now_s = time.monotonic()
-        if now_s - said_s >= PROGRESS_S:
-            said_s = now_s
-            station.flush()
-            control.send(("progress", station.progress()))
-        if control.poll():
-            _, finish = control.recv()
-            break
-    for messages in reception.drain(finish["robot_messages"]):
-        put(messages)
-    station.close()
-    cpu_s, resident = resources()
-    control.send(("done", Result(spec.name, cpu_s, resident, extra=station.result())))
-    control.recv()
+    def report(self, refused: int = 0) -> RecorderReport:
+        """Returns the trace, and what became of the recording; `refused` messages did not come so far."""
+        return RecorderReport(self._trace.build(), self.messages, refused, self.recorder.failure)

@@ -11,7 +11,7 @@ from typing import Any
 from echelon.plan import Plan
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load
-from echelon.sim.trace import Trace, TraceBuilder
+from echelon.sim.results.trace import Trace, TraceBuilder
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIOS = ROOT / "deploy" / "scenarios"
@@ -52,6 +52,9 @@ def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
         text=True,
         cwd=ROOT,
         start_new_session=True,
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # where tests run in the background it is ignored
     )
 
 

@@ -1,12 +1,14 @@
 """A run whose every number is known: the paper's plan with errors that decay exponentially, each layer at its rate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from echelon.bridge.reports import BusReport, CanReport
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.link import LinkCounts
@@ -14,7 +16,8 @@ from echelon.messages import STATE_FIELDS
 from echelon.plan import Plan
 from echelon.scenario import Scenario
 from echelon.sim.parts import load
-from echelon.sim.trace import Trace
+from echelon.sim.results.records import RunFacts
+from echelon.sim.results.trace import Trace
 
 PAPER = Path(__file__).parent.parent / "deploy" / "scenarios" / "paper.toml"
 DECAY = {"intra": 0.02, "inter": 0.2, "centroid": 2.0}
@@ -98,3 +101,20 @@ def link_counts(plan: Plan) -> list[LinkCounts]:
     first = plan.links[0]
     ideal[0] = LinkCounts(first.source, first.receiver, first.channel, 10, 7, 2, 1, 9, 3, 2_500_000.25, 6_000_000)
     return ideal
+
+
+def run_facts(**given: Any) -> RunFacts:
+    """Returns how a run was run, with what is given instead."""
+    facts = RunFacts("inprocess", "virtual", 6.0, 0.0, 2.0, 200.0, 0, None)
+    return replace(facts, **given)
+
+
+def can_report(**given: Any) -> CanReport:
+    """Returns the report of a bus on which nothing happened, with what is given instead."""
+    bus = BusReport("can0", 500_000, 0.25)
+    report = CanReport(
+        path="mirror", timing=None, url="virtual", listen="", torque_scale=0.001, log_start=0.0, frames=12, load_mean=0.25,
+        fit=("can0 fits",), advice=(), buses=(bus,), scheduled=(), sent=12, failed=0, dropped=0, log_lost=0, log_error=None,
+        robots={},
+    )  # fmt: skip
+    return replace(report, **given)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from synthetic import DECAY, FIELD, decaying, with_states
 
-from echelon.sim.blocks import Blocks, BlockSeries, block_series, component_names
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import Blocks, BlockSeries, block_series, component_names
+from echelon.sim.results.trace import Trace
 
 
 @pytest.fixture(scope="module")

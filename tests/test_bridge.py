@@ -1,23 +1,23 @@
 """The bridge: one frame per robot and period, and never torque that nobody commanded."""
 
-import json
 import math
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon.bridge.bridge import Bridge, Stop
 from echelon.bridge.bus_load import frame_bits
 from echelon.bridge.native.codec import NativeCodec, Torque
 from echelon.bridge.native.counter import CounterCheck
+from echelon.bridge.reports import WheelsReport
+from echelon.bridge.torque_mirror import Stop, TorqueMirror
 
 MS = 1_000_000
 CODEC = NativeCodec(0.001)
 
 
-def make() -> Bridge:
-    return Bridge(["g1/r1", "g1/r2"], 0.001, 10 * MS)
+def make() -> TorqueMirror:
+    return TorqueMirror(["g1/r1", "g1/r2"], 0.001, 10 * MS)
 
 
 def said(robot: int, right: float, left: float, enable: bool, counter: int) -> Torque:
@@ -38,7 +38,9 @@ def test_one_frame_per_robot_and_period_in_order() -> None:
         said(robot, 1.0 + robot, -0.5, True, step % 16) for step in range(20) for robot in (0, 1)
     ]
     assert bridge.frames == 40
-    assert bridge.bits == sum(frame_bits(can_id, data) for ((can_id, data),) in frames)
+    assert sum(counts.bits.bits for counts in bridge.counts) == sum(
+        frame_bits(can_id, data) for ((can_id, data),) in frames
+    )
     assert [counts.skipped for counts in bridge.counts] == [0, 0]
 
 
@@ -76,24 +78,15 @@ def test_stop_on_request() -> None:
     assert bridge.counts[1].stopped == {Stop.REQUESTED: 1, Stop.MISSING: 1}
 
 
-def test_summary() -> None:
+def test_report() -> None:
     bridge = make()
     bridge.encode(0, 0, 40.0, -1.0)
     bridge.encode(10 * MS, 0, -2.0, 50.0, saturated=True)
     bridge.encode(20 * MS, 0, math.nan, 0.0)
-    summary = json.loads(json.dumps(bridge.summary(), allow_nan=False))
-    assert summary["robots"]["g1/r1"] == {
-        "frames": 3,
-        "stopped": {"not finite": 1},
-        "repeated": 0,
-        "skipped": 0,
-        "clipped": 2,
-        "saturated": 1,
-        "torque_min": [-2.0, -1.0],
-        "torque_max": [40.0, 50.0],
-    }
-    assert summary["robots"]["g1/r2"]["torque_min"] is None
-    assert (summary["frames"], summary["torque_limit"]) == (3, pytest.approx(32.767))
+    stopped = {"not finite": 1}
+    assert bridge.report(0, "native") == WheelsReport("native", 3, stopped, 50.0, clipped=2, saturated=1)
+    assert bridge.report(1, "native") == WheelsReport("native", 0, {}, 0.0)
+    assert bridge.frames == 3
 
 
 torques = st.floats(allow_nan=True, allow_infinity=True)
@@ -120,8 +113,8 @@ def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> Non
 
 def test_refused() -> None:
     with pytest.raises(ValueError, match="127 robots"):
-        Bridge(["r"] * 128, 0.001, 1)
+        TorqueMirror(["r"] * 128, 0.001, 1)
     with pytest.raises(ValueError, match="period"):
-        Bridge(["r"], 0.001, 0)
+        TorqueMirror(["r"], 0.001, 0)
     with pytest.raises(IndexError):
         make().encode(0, 2, 0.0, 0.0)

@@ -295,6 +295,30 @@ def test_receiving_on_a_raw_socket() -> None:
     bus.close()
 
 
+class Stamped:
+    """Stands for a raw CAN socket from which frames come with these stamps [ns]."""
+
+    def __init__(self, stamps: list[int]) -> None:
+        self.stamps = stamps
+
+    def recvmsg(self, size: int, space: int, flags: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
+        stamp = struct.pack("@ll", *divmod(self.stamps.pop(0), 1_000_000_000))
+        return kernel_frame(1, b""), [(0, 0, stamp)], 0, None
+
+    def send(self, frame: bytes, flags: int) -> int:
+        return len(frame)
+
+
+def test_stamps_of_frames_do_not_run_backwards_but_with_the_clock() -> None:
+    """Two processors stamp side by side; a clock that is set back by seconds is another matter."""
+    bus, _, _ = raw_bus([])
+    at, back = 1_700_000_000_000_000_000, 5_000_000_000
+    bus._wire = RawCan(Stamped([at, at - 2_000, at + 1, at - back, at - back + 7]), "vcan0")  # type: ignore[arg-type]
+    got = [bus.recv(0.0) for _ in range(5)]
+    assert [frame and frame.time_ns - at for frame in got] == [0, 0, 1, -back, 7 - back]
+    bus.close()
+
+
 def test_waiting_on_a_raw_socket_ends_with_a_frame_or_with_the_time() -> None:
     bus, _, _ = raw_bus([])
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -13,7 +13,7 @@ from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.sim.engine import Engine
-from echelon.sim.trace import TraceBuilder
+from echelon.sim.results.trace import TraceBuilder
 from tests.runs import plan_of
 
 MS = 1_000_000
@@ -36,7 +36,7 @@ def ran(plan: Plan, sink: Callable[[Message], None] = lambda message: None) -> E
 
 def stations(engine: Engine) -> tuple[Commander, DriveBank]:
     """Returns the bridge and the drives of a run."""
-    bridge, drives = (engine.roles[station.index] for station in engine.plan.stations)
+    bridge, drives = (engine.roles[station.index] for station in engine.plan.bus_roles)
     assert isinstance(bridge, Commander)
     assert isinstance(drives, DriveBank)
     return bridge, drives
@@ -106,8 +106,8 @@ def test_wheels_get_what_was_wanted_within_quantisation(protocol: str, step: flo
     assert found.max() <= step / 2 * (1 + 1e-9)
     assert found.max() > 0  # the frames did round
     bridge, _ = stations(engine)
-    for row in bridge.summary().values():
-        assert (row["enabled"], row["fault"], sum(row["stopped"].values()), row["refused"]) == (True, "", 0, {})
+    for row in bridge.reports().values():
+        assert (row.enabled, row.fault, sum(row.stopped.values()), row.refused) == (True, "", 0, {})
 
 
 def test_the_bus_takes_time_and_the_wheels_see_it() -> None:
@@ -129,9 +129,7 @@ def test_bring_up_is_over_before_the_run_and_without_torque() -> None:
     for protocol in PROTOCOLS:
         heard = Heard()
         engine = ran(closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", duration=0.1), heard)
-        early = [
-            timed for source, timed in heard.frames if source == engine.plan.stations[0].index and timed.time_ns < 0
-        ]
+        early = [timed for source, timed in heard.frames if source == engine.plan.bridge.index and timed.time_ns < 0]
         assert any(timed.node == BRIDGE_NODE for timed in early)
         assert any(timed.node != BRIDGE_NODE for timed in early)
         assert all(robot.host.enabled for robot in stations(engine)[0].robots)
@@ -142,7 +140,7 @@ def test_bring_up_is_over_before_the_run_and_without_torque() -> None:
 @pytest.mark.parametrize("dead", ["g1/r1", "g2", "coordinator", "bridge"])
 def test_whoever_dies_wheel_torque_is_zero_within_the_watchdog_time_plus_one_frame(protocol: str, dead: str) -> None:
     plan = closed(f"robot.drive.protocol={protocol}", "can.timing=ideal")
-    index = next(one.index for one in plan.everyone if one.name == dead)
+    index = next(one.index for one in plan.all_roles if one.name == dead)
     heard = Heard()
     engine = Engine(plan, heard)
     dies_ns = 1000 * MS
@@ -174,16 +172,16 @@ def test_a_robot_that_is_not_heard_gets_no_torque() -> None:
     got = np.array([row for time_ns, row in heard.got.items() if time_ns > 100 * MS])
     assert not got[:, 0].any()
     assert np.abs(got[:, 1:]).max(axis=(0, 2)).min() > 0.01
-    assert stations(engine)[0].summary()["g1/r1"]["largest"] == 0.0
+    assert stations(engine)[0].reports()["g1/r1"].largest == 0.0
 
 
 def test_a_torque_older_than_the_watchdog_is_not_sent() -> None:
     heard = Heard()
     engine = ran(closed('links=[{source="g1/*", receiver="bridge", channel="torque", delay=0.15}]'), heard)
     assert not np.array(list(heard.got.values()))[:, :3].any()
-    rows = stations(engine)[0].summary()
-    assert rows["g1/r1"]["stopped"][NOT_COMMANDED] > 150
-    assert not rows["g2/r4"]["stopped"].get(NOT_COMMANDED)
+    rows = stations(engine)[0].reports()
+    assert rows["g1/r1"].stopped[NOT_COMMANDED] > 150
+    assert not rows["g2/r4"].stopped.get(NOT_COMMANDED)
 
 
 FAULTS = ("over_temperature", "encoder_loss", "brown_out")
@@ -374,7 +372,7 @@ def test_one_disturbance_does_not_swing_on(kind: str) -> None:
     for node in range(1, 19):
         came = [timed.time_ns for source, timed in heard.frames if timed.frame.can_id == 0x280 + node and source == 13]
         assert np.diff([time_ns for time_ns in came if time_ns > 2000 * MS]).max() < 1.5 * PERIOD
-    assert all(row["enabled"] for row in stations(engine)[0].summary().values())
+    assert all(row.enabled for row in stations(engine)[0].reports().values())
 
 
 def test_a_drive_that_is_off_the_bus_comes_back_with_news_only() -> None:

@@ -16,7 +16,7 @@ from echelon.bridge.bus_url import resolve_url
 from echelon.bridge.canlog import read_log
 from echelon.bridge.frame_message import BRIDGE_NODE
 from echelon.bridge.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
-from echelon.sim.joining import ProcessSpec
+from echelon.sim.contract import ProcessSpec
 from echelon.sim.supervisor import Supervisor
 from tests.runs import echelon, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, until
 

@@ -12,12 +12,12 @@ from echelon.controller.laws.central import CentralLaw
 from echelon.controller.sampled import spectral_radius
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Array, Plan
-from echelon.sim.blocks import block_series
-from echelon.sim.distances import distances
 from echelon.sim.engine import Engine
-from echelon.sim.measures import claim_rows
 from echelon.sim.parts import load
-from echelon.sim.trace import Trace, TraceBuilder
+from echelon.sim.results.blocks import block_series
+from echelon.sim.results.distances import distances
+from echelon.sim.results.measures import claim_results
+from echelon.sim.results.trace import Trace, TraceBuilder
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 UNTIL = 2.0
@@ -101,11 +101,11 @@ def test_without_lead_the_hold_costs_what_its_period_is(reference):
 
 
 def test_claims_of_the_paper_hold(paper):
-    rows = {row["block"]: row for row in claim_rows(paper.plan, block_series(paper))}
-    assert [row["block"] for row in rows.values()] == ["intra", "inter", "centroid"]
+    rows = {row.block: row for row in claim_results(paper.plan, block_series(paper))}
+    assert [row.block for row in rows.values()] == ["intra", "inter", "centroid"]
     for row, about in zip(rows.values(), (0.1, 1.0, 10.0), strict=True):
-        assert row["holds"]
-        assert about / 3 < row["measured"] <= about
+        assert row.holds
+        assert about / 3 < row.measured <= about
 
 
 def test_blocks_settle_one_after_the_other(paper):
@@ -129,8 +129,8 @@ def test_avoidance_keeps_robots_apart_where_they_would_meet(paper):
     assert kept.closest is not None
     assert kept.closest.distance > radius
     assert kept.violations == ()
-    for row in claim_rows(apart.plan, block_series(apart)):
-        assert row["holds"]
+    for row in claim_results(apart.plan, block_series(apart)):
+        assert row.holds
 
 
 def test_one_seed_is_one_run_and_another_is_not():

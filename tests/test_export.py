@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from synthetic import FIELD, decaying, link_counts
 
-from echelon.sim.blocks import block_series
 from echelon.sim.export import ROBOT_FIELDS, export_csv
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import block_series
+from echelon.sim.results.trace import Trace
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_links_are_one_row_each(run, folder):
     assert len(found) == len(run.plan.links)
     first = run.plan.links[0]
     assert found[0] == {
-        "source": run.plan.members[first.source].name, "receiver": run.plan.members[first.receiver].name,
+        "source": run.plan.formation[first.source].name, "receiver": run.plan.formation[first.receiver].name,
         "channel": first.channel.name.lower(), "sent": "10", "delivered": "7", "lost": "2", "in_flight": "1",
         "used": "9", "held": "3", "age_mean": "0.00250000025", "age_max": "0.006",
     }  # fmt: skip

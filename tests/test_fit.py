@@ -24,7 +24,7 @@ def test_cyclic_identifiers_come_as_often_and_wait_no_longer_than_the_fit_says(
     overrides.append(f"can.bitrate={1_000_000 if protocol == 'odrive' else 500_000}")
     plan = plan_of("lab", *overrides, *([] if robots_on_bus == 9 else three_buses))
     engine = Engine(plan)
-    commander = engine.roles[plan.stations[0].index]
+    commander = engine.roles[plan.bridge.index]
     assert isinstance(commander, Commander)
     traffic, fit = commander.buses[0].traffic, bus_fit(plan, 0)
     before: dict[int, int] = {}

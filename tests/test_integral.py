@@ -17,8 +17,8 @@ from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.law import law_block
 from echelon.controller.sampled import delay_margin, largest_stable_delay, linear_gains, spectral_radius
 from echelon.plan import Array, Plan
-from echelon.sim.blocks import block_series
 from echelon.sim.parts import REGISTRY, load
+from echelon.sim.results.blocks import block_series
 
 REST = {"kind": "line", "velocity": (0.0, 0.0)}
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from runs import plan_of
 
+from echelon.bridge.reports import BridgeProgress
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
@@ -35,7 +36,7 @@ def progress_with(errors: dict[str, float], time_ns: int = 2_000_000_000) -> Pro
         flat[block.offset] += errors.get(block.name, 0.0)
     states = np.zeros((len(PLAN.robots), len(STATE_FIELDS)))
     states[:, :2] = cbt.backward(flat.reshape(shape.shape))
-    return Progress("running", time_ns, time_ns, states, 1234, 1.0, {"load": 0.25, "url": "virtual:x"})
+    return Progress("running", time_ns, time_ns, states, 1234, 1.0, BridgeProgress("virtual:x", 0.25, 12))
 
 
 def test_errors_of_blocks() -> None:

@@ -13,6 +13,7 @@ from echelon.mailbox import SLACK, Mailbox
 from echelon.messages import NULL, Channel, Message
 from echelon.plan import LinkPlan
 from echelon.role import Input, Stage
+from echelon.turns import Turn
 
 PERIOD = 10
 RECEIVER = 9
@@ -21,9 +22,9 @@ RECEIVER = 9
 def mailbox_of(links: Sequence[LinkPlan], seed: int = 1, stages: Sequence[Stage] | None = None) -> Mailbox:
     """Returns the mailbox of a role that hears every link in each of its stages."""
     inputs = tuple(Input(link.source, link.channel) for link in links)
-    stages = stages or [Stage("all", 0, PERIOD, inputs, lambda time_ns, heard: ())]
+    stages = stages or [Stage(Turn.ACT, PERIOD, inputs, lambda time_ns, heard: ())]
     plan: Any = SimpleNamespace(
-        everyone=[SimpleNamespace(name=f"m{index}") for index in range(RECEIVER + 1)],
+        all_roles=[SimpleNamespace(name=f"m{index}") for index in range(RECEIVER + 1)],
         seed=seed,
         links_into=lambda receiver: tuple(links) if receiver == RECEIVER else (),
     )
@@ -182,7 +183,7 @@ def test_memory_is_bounded_when_nothing_in_use_comes():
 def test_stages_share_an_input():
     link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD)
     inputs = (Input(0, Channel.STATE),)
-    stages = [Stage(name, 0, period, inputs, lambda time_ns, heard: ()) for name, period in (("a", 10), ("b", 30))]
+    stages = [Stage(Turn.ACT, period, inputs, lambda time_ns, heard: ()) for period in (10, 30)]
     mailbox = mailbox_of([link], stages=stages)
     for tick in range(7):
         mailbox.deliver(message_of(link, tick))

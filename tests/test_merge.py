@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.messages import Channel, Message
-from echelon.sim.merge import TimeOrder
+from echelon.sim.time_order import TimeOrder
 
 
 def message(source: int, time_ns: int, channel: Channel = Channel.STATE) -> Message:

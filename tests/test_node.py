@@ -235,7 +235,7 @@ def test_slow_coordinator_hands_down_forces_of_its_own_pairs_only():
 def _leader_alone(plan: Plan, index: int, run: Watched, time_ns: int, reference: Array) -> Array:
     """Returns what a leader commands for given states and a given reference where nobody avoids anybody."""
     leader = Engine(plan).roles[index]
-    node = plan.members[index]
+    node = plan.formation[index]
     leader.stages[0].run(time_ns, [run.said[Channel.STATE, child, time_ns] for child in node.children])
     (message,) = leader.stages[1].run(time_ns, [Message(Channel.REFERENCE, plan.root.index, 0, 0, reference)])
     return message.values.reshape(-1, 2)

@@ -6,13 +6,14 @@ from itertools import count
 
 import pytest
 
-from echelon.bridge import on_bus as on_bus_module
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.frame import Frame
 from echelon.bridge.frame_message import NO_BUS, TimedFrame, pack
-from echelon.bridge.on_bus import BusError, Rail, on_bus
+from echelon.bridge.stations import rail as on_bus_module
+from echelon.bridge.stations.rail import BusError, Rail, on_bus
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
+from echelon.turns import Turn
 
 NUMBERS = count()
 OF_BRIDGE = [TimedFrame(1000 * at, 0, 0, Frame(0x100 + at, bytes([at] * 8))) for at in range(3)]
@@ -38,7 +39,7 @@ def station(rail: Rail, is_bridge: bool, says: list[TimedFrame], heard: list[Hea
         heard.extend(messages)  # type: ignore[arg-type]
         return (message(says),) if says else ()
 
-    (stage,) = on_bus([Stage("any", 0, 1, (), run)], rail, is_bridge)
+    (stage,) = on_bus([Stage(Turn.HEAR, 1, (), run)], rail, is_bridge)
     return stage
 
 

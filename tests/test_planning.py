@@ -62,7 +62,7 @@ def refusal(text: str, *overrides: str) -> str:
 
 def test_members_are_numbered_robots_first_then_children_before_parents():
     plan = paper()
-    assert [member.index for member in plan.members] == list(range(13))
+    assert [member.index for member in plan.formation] == list(range(13))
     assert [robot.path for robot in plan.robots][:4] == ["g1/r2", "g1/r1", "g1/r3", "g2/r4"]
     assert [node.path for node in plan.nodes] == ["g1", "g2", "g3", ""]
     assert [node.name for node in plan.nodes][-1] == "coordinator"
@@ -104,7 +104,7 @@ def test_a_deep_and_mixed_tree():
     assert plan.nodes[2].weights == (2, 1)
     assert [node.first_robot for node in plan.nodes] == [1, 3, 1, 0]
     assert [node.depth for node in plan.nodes] == [2, 2, 1, 0]
-    for member in plan.members:
+    for member in plan.formation:
         if member.parent is not None:
             assert plan.nodes[member.parent - 4].children[member.child_number] == member.index
     assert [(block.name, block.layer, block.offset, block.size) for block in plan.blocks] == [
@@ -403,7 +403,7 @@ def test_one_group_alone_is_intra():
 
 def test_the_trees_links():
     plan = paper()
-    names = [member.name for member in plan.members]
+    names = [member.name for member in plan.formation]
     found = {(names[link.source], names[link.receiver], link.channel) for link in plan.links}
     expected = set()
     for robot in plan.robots:
@@ -424,7 +424,7 @@ def test_the_last_fitting_rule_holds_alone():
         "links.1={source='g1/*',delay={min=0.001,max=0.003}}",
         "links.2={channel='reference',receiver='g2',loss=0.25}",
     )
-    names = [member.name for member in plan.members]
+    names = [member.name for member in plan.formation]
     for link in plan.links:
         values = link.delay_min_ns, link.delay_max_ns, link.loss
         if names[link.source].startswith("g1/"):

@@ -58,7 +58,7 @@ def record(path: Path, ticks: int = 21, flush_every: int = 0) -> list[Message]:
 
 def topic_of(message: Message) -> str:
     """Returns the topic on which a message must be."""
-    path = paper().members[message.source].path
+    path = paper().formation[message.source].path
     name = {Channel.GROUP_STATE: "state"}.get(message.channel, message.channel.name.lower())
     return "/" + "/".join(part for part in (path, name) if part)
 

@@ -18,7 +18,7 @@ from echelon.messages import Channel, Message
 from echelon.sim import chunked
 from echelon.sim.recorder import Recorder
 from echelon.sim.recording import CutError, read_links, read_metadata, read_scenario, read_trace, recover
-from echelon.sim.trace import TraceBuilder
+from echelon.sim.results.trace import TraceBuilder
 
 SCENARIO = 'name = "µ"\r\n'
 LINKS = [LinkCounts(0, 9, Channel.STATE, 21, 20, 1, 0, 20, 2, 1.5e6 / 7, 3_000_000)]

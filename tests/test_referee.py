@@ -17,7 +17,8 @@ from echelon.bridge.canlog import CanLog
 from echelon.bridge.frame import Frame
 from echelon.bridge.frame_message import unpack
 from echelon.bridge.referee import KEPT, Referee, judge_log
-from echelon.bridge.station import Station
+from echelon.bridge.reports import FindingReport
+from echelon.bridge.stations.mirror import MirrorBridge
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.sim.engine import Engine
@@ -55,7 +56,7 @@ def run(protocol: str, *overrides: str) -> tuple[Plan, tuple[Heard, ...]]:
     carried: list[Heard] = []
 
     def take(message: Message) -> None:
-        if message.channel is Channel.FRAMES and message.source == plan.stations[0].index:
+        if message.channel is Channel.FRAMES and message.source == plan.bridge.index:
             carried.extend((timed.time_ns, timed.bus, timed.frame) for timed in unpack(message.values))
 
     Engine(plan, take).run()
@@ -96,20 +97,20 @@ def with_crc(can_id: int, body: bytes) -> bytes:
 @each_protocol
 def test_nothing_is_found_in_a_run(protocol: str) -> None:
     plan, frames = run(protocol)
-    summary = judged(plan, frames).summary()
-    assert (summary["kinds"], summary["findings"], summary["unknown"]) == ({}, [], 0)
-    assert summary["frames"] == len(frames) > 2500
-    assert len(summary["identifiers"]) == IDENTIFIERS[protocol]
-    assert sum(row["frames"] for row in summary["identifiers"].values()) == len(frames)
+    summary = judged(plan, frames).report()
+    assert (summary.kinds, summary.findings, summary.unknown) == ({}, (), 0)
+    assert summary.frames == len(frames) > 2500
+    assert len(summary.identifiers) == IDENTIFIERS[protocol]
+    assert sum(row.frames for row in summary.identifiers.values()) == len(frames)
     for can_id in (*COMMAND_IDS[protocol], *REPORT_IDS[protocol]):
-        row = summary["identifiers"][f"can0:{can_id:03X}"]
+        row = summary.identifiers[f"can0:{can_id:03X}"]
         times = [time_ns for time_ns, _, frame in frames if frame.can_id == can_id and time_ns >= 0]
         gaps = [after - before for before, after in zip(times, times[1:], strict=False)]
-        assert (row["period_min"], row["period_max"]) == pytest.approx((min(gaps) / 1e9, max(gaps) / 1e9))
-        assert row["period_mean"] == pytest.approx((times[-1] - times[0]) / 1e9 / len(gaps), rel=1e-9)
-        assert row["period_mean"] == pytest.approx(0.01, rel=0.01)
+        assert (row.period_min, row.period_max) == pytest.approx((min(gaps) / 1e9, max(gaps) / 1e9))
+        assert row.period_mean == pytest.approx((times[-1] - times[0]) / 1e9 / len(gaps), rel=1e-9)
+        assert row.period_mean == pytest.approx(0.01, rel=0.01)
         spread = sum((gap - sum(gaps) / len(gaps)) ** 2 for gap in gaps) / len(gaps)
-        assert row["jitter"] == pytest.approx(spread**0.5 / 1e9, rel=1e-6)
+        assert row.jitter == pytest.approx(spread**0.5 / 1e9, rel=1e-6)
 
 
 @pytest.mark.parametrize("timing", ["ideal", "mirror"])
@@ -117,17 +118,17 @@ def test_nothing_is_found_in_a_run(protocol: str) -> None:
 def test_nothing_is_found_without_bits_or_without_drives(protocol: str, timing: str, tmp_path: Path) -> None:
     if timing == "ideal":
         plan, frames = run(protocol, "can.timing=ideal")
-        summary = judged(plan, frames).summary()
+        summary = judged(plan, frames).report()
     else:
         plan = plan_of("lab", "duration=1", "claims=[]", f"robot.drive.protocol={protocol}")
-        station = Station(plan, ["virtual:referee"], tmp_path)
-        Engine(plan, lambda message: station.put([message]).clear()).run()
+        station = MirrorBridge(plan, ["virtual:referee"], tmp_path)
+        Engine(plan, lambda message: station.take([message]).clear()).run()
         station.close()
         summary = judge_log(tmp_path / "can.log", plan)
-        assert len(summary["identifiers"]) == (9 if protocol == "native" else 18)
-        assert summary["frames"] == 100 * len(summary["identifiers"])
-    assert (summary["kinds"], summary["unknown"]) == ({}, 0)
-    assert summary["frames"] >= 900
+        assert len(summary.identifiers) == (9 if protocol == "native" else 18)
+        assert summary.frames == 100 * len(summary.identifiers)
+    assert (summary.kinds, summary.unknown) == ({}, 0)
+    assert summary.frames >= 900
 
 
 def test_two_buses() -> None:
@@ -135,7 +136,7 @@ def test_two_buses() -> None:
     referee = judged(plan, frames)
     assert referee.kinds == {}
     assert {bus for _, bus, _ in frames} == {0, 1}
-    assert {name.partition(":")[0] for name in referee.summary()["identifiers"]} == {"a", "b"}
+    assert {name.partition(":")[0] for name in referee.report().identifiers} == {"a", "b"}
     wrong = judged(plan, [(time_ns, 1 - bus, frame) for time_ns, bus, frame in frames])
     assert wrong.kinds["missing"] == 3  # nodes 1 to 6 are on both, 7 to 12 are on the first alone
     assert wrong.unknown > 0
@@ -149,7 +150,7 @@ def test_a_frame_that_is_missing(protocol: str, data: st.DataObject) -> None:
     at = data.draw(st.sampled_from(cyclic(protocol)))
     referee = judged(plan, frames[:at] + frames[at + 1 :])
     assert referee.kinds["gap"] >= 1
-    assert {row["id"] for row in referee.kept if row["kind"] == "gap"} == {f"{frames[at][2].can_id:03X}"}
+    assert {row.id for row in referee.kept if row.kind == "gap"} == {f"{frames[at][2].can_id:03X}"}
     # without the largest command there is a report that nobody asked for
     assert set(referee.kinds) <= {"gap", "counter gap", "heartbeat missing", "torque not commanded"}
 
@@ -163,7 +164,7 @@ def test_a_frame_that_comes_twice(protocol: str, data: st.DataObject) -> None:
     referee = judged(plan, frames[: at + 1] + frames[at:])
     zero = protocol != "native" and frames[at][2].can_id in command_ids(plan) and not any(frames[at][2].data)
     assert referee.kinds["burst"] + referee.kinds["counter repeated"] >= (0 if zero else 1)
-    assert {row["id"] for row in referee.kept} <= {f"{frames[at][2].can_id:03X}"}
+    assert {row.id for row in referee.kept} <= {f"{frames[at][2].can_id:03X}"}
 
 
 def command_ids(plan: Plan) -> set[int]:
@@ -193,7 +194,7 @@ def test_a_bit_that_flipped_in_a_native_frame(data: st.DataObject) -> None:
     broken = (int.from_bytes(frame.data, "little") ^ 1 << bit).to_bytes(8, "little")
     referee = judged(plan, (*frames[:at], (time_ns, bus, frame._replace(data=broken)), *frames[at + 1 :]))
     assert referee.kinds["crc"] == 1
-    assert referee.kept[0]["time"] == time_ns / 1e9
+    assert referee.kept[0].time == time_ns / 1e9
 
 
 @pytest.mark.parametrize(("protocol", "byte", "bit"), [("odrive", 3, 6), ("cia402", 1, 6)])
@@ -283,8 +284,8 @@ def test_torque_that_goes_on_though_nobody_commands(protocol: str, at_ms: int) -
     referee = judged(plan, [heard for heard in frames if heard[0] < at_ms * MS or heard[2].can_id not in gone])
     assert referee.kinds["silent"] == len(gone)
     assert {"torque after silence", "torque not commanded"} <= set(referee.kinds)
-    assert min(row["time"] for row in referee.kept if row["kind"] == "torque after silence") < at_ms / 1e3 + 0.2
-    assert {row["robot"] for row in referee.kept} == {"g1/r1"}
+    assert min(row.time for row in referee.kept if row.kind == "torque after silence") < at_ms / 1e3 + 0.2
+    assert {row.robot for row in referee.kept} == {"g1/r1"}
 
 
 @each_protocol
@@ -401,7 +402,7 @@ def test_robots_of_which_nothing_came(mirror: Plan) -> None:
     assert [(found.kind, found.can_id) for found in referee.finish(10 * MS)] == [
         ("missing", 0x100 + robot) for robot in range(9)
     ]
-    assert [row["robot"] for row in referee.kept] == [robot.path for robot in plan.robots]
+    assert [row.robot for row in referee.kept] == [robot.path for robot in plan.robots]
 
 
 def test_planned_faults() -> None:
@@ -409,7 +410,7 @@ def test_planned_faults() -> None:
     for protocol in PROTOCOLS:
         referee = judged(*run(protocol, stuck))
         assert set(referee.kinds) == {"torque not commanded"}, protocol
-        assert {row["robot"] for row in referee.kept} == {"g1/r1"}
+        assert {row.robot for row in referee.kept} == {"g1/r1"}
     estop = 'events=[{kind="estop",at=0.3}]'
     assert judged(*run("native", estop)).kinds == {}
     disturbed = 'events=[{kind="error_frames",at=0.2,duration=0.6,rate=0.05}]'
@@ -423,10 +424,10 @@ def test_the_log_of_a_run(tmp_path: Path) -> None:
         for time_ns, _, (can_id, data, remote) in frames:
             log.write(time_ns, can_id, data, 0, "", remote)
     summary = judge_log(path, plan)
-    assert (summary["kinds"], summary["frames"], len(summary["identifiers"])) == ({}, len(frames), 27)
+    assert (summary.kinds, summary.frames, len(summary.identifiers)) == ({}, len(frames), 27)
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[: len(lines) // 2]))
-    assert judge_log(path, plan)["kinds"] == {"silent": 27}
+    assert judge_log(path, plan).kinds == {"silent": 27}
     with pytest.raises(OSError, match="No such file"):
         judge_log(tmp_path / "none.log", plan)
 
@@ -437,16 +438,9 @@ def test_findings_are_counted_and_the_first_kept() -> None:
     for at in range(3 * KEPT):
         referee.observe(at * 10 * MS, 0, Frame(0x100, bytes(8)))
     assert referee.kinds["crc"] == 3 * KEPT
-    assert len(referee.summary()["findings"]) == KEPT
-    first = referee.summary()["findings"][0]
-    assert first | {"text": ""} == {
-        "time": 0.0,
-        "bus": "can0",
-        "id": "100",
-        "kind": "crc",
-        "robot": "g1/r1",
-        "text": "",
-    }
+    assert len(referee.report().findings) == KEPT
+    first = referee.report().findings[0]
+    assert replace(first, text="") == FindingReport(0.0, "can0", "100", "crc", "", "g1/r1")
 
 
 def test_callers_mistakes() -> None:

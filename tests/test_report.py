@@ -7,17 +7,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import FIELD, PERIOD_NS, Run, decaying, link_counts
+from synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
 
+from echelon.bridge.reports import (
+    BusEvent,
+    BusReport,
+    DriveReport,
+    DrivesReport,
+    FindingReport,
+    IdentifierReport,
+    RefereeReport,
+    ScheduledEvent,
+    WheelsReport,
+)
 from echelon.load import effective_toml
 from echelon.sim.drawing import COLUMNS, thin
 from echelon.sim.report import RunForReport, write_report
-from echelon.sim.summary import summarise
-from echelon.sim.trace import Trace
+from echelon.sim.results.summary import summarise
+from echelon.sim.results.trace import Trace
 
 FIGURES = 5
 NAME = "one & <b>only</b>"
-CAN = {"enabled": True, "url": "virtual", "frames": 1234, "load_mean": 0.5, "load_peak": 1.5, "clipped": 7}
+CAN = can_report(frames=1234, load_mean=0.5, robots={"g1/r1": WheelsReport("native", 1234, {}, 1.0, clipped=7)})
 FRAMES = ({"id": "0x101", "torque": "<1.5>"}, {"id": "0x102", "torque": "2.5"})
 
 
@@ -60,7 +71,7 @@ class Page(HTMLParser):
 
 def for_report(run: Run, name: str, trace: Trace | None = None) -> RunForReport:
     trace = trace or run.trace
-    summary = summarise(trace, link_counts(run.plan), CAN, {"real_time_factor": 2.0})
+    summary = summarise(trace, link_counts(run.plan), CAN, run_facts())
     return RunForReport(name, trace, summary, effective_toml(run.scenario), FRAMES)
 
 
@@ -129,32 +140,25 @@ def test_verdict_claims_and_numbers_are_on_the_page(single):
 
 
 def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
-    identifier = {"frames": 5, "lost": 1, "destroyed": 2, "latency_mean": 1e-3, "latency_max": 2e-3}
-    buses = [
-        {
-            "name": "can0",
-            "bitrate": 500_000,
-            "load": 0.25,
-            "events": [{"time": 2.5, "node": 1, "who": "g1/r1", "event": "bus-off"}],
-            "identifiers": {"100": identifier | {"latency_bound": 3e-3}, "101": identifier | {"latency_bound": None}},
-        }
-    ]
-    finding = {"time": 1.5, "bus": "can0", "id": "100", "kind": "gap", "text": "<late>", "robot": "g1/r1"}
-    can = {
-        "scheduled": [{"time": 2.0, "until": 4.0, "what": "estop", "whom": ["g1/r1", "g1/r2"]}],
-        "frames": 11,
-        "load_mean": 0.25,
-        "buses": buses,
-        "robots": {"g1/r1": {"protocol": "odrive", "stopped": {"rise limit": 3}, "fault": "right: hot"}},
-        "drives": {"robots": {"g1/r1": {"temperature": 71.25}}},
-        "referee": {"frames": 11, "kinds": {"gap": 1}, "findings": [finding]},
+    identifiers = {
+        "100": IdentifierReport(5, 1, 2, 1e-3, 2e-3, 3e-3),
+        "101": IdentifierReport(5, 1, 2, 1e-3, 2e-3, None),
     }
+    events = (BusEvent(2.5, 1, "g1/r1", "bus-off"),)
+    can = can_report(
+        path="closed",
+        scheduled=(ScheduledEvent(2.0, 4.0, "estop", ("g1/r1", "g1/r2")),),
+        buses=(BusReport("can0", 500_000, 0.25, events=events, identifiers=identifiers),),
+        robots={"g1/r1": WheelsReport("odrive", 5, {"rise limit": 3}, 1.5, enabled=False, fault="right: hot")},
+        drives=DrivesReport({"g1/r1": DriveReport({}, 0, 71.25)}, {}),
+        referee=RefereeReport(11, 0, {"gap": 1}, (FindingReport(1.5, "can0", "100", "gap", "<late>", "g1/r1"),), {}),
+    )
     one = for_report(run, "bus")
-    text = rendered([replace(one, summary=one.summary | {"can": can})], tmp_path / "report.html").text
+    text = rendered([replace(one, summary=replace(one.summary, can=can))], tmp_path / "report.html").text
     assert "loaded to 25 %," in text
     assert "became zero before the bus: 3 times rise limit" in text
     assert "100 5 1 2 1 2 3 101 5 1 2 1 2 –" in text
-    assert "g1/r1 odrive right: hot 3 rise limit 71.25" in text
+    assert "g1/r1 odrive 5 1.5 0 0 0 0 False right: hot 3 rise limit 71.25" in text
     assert "11 frames and found 1 gap" in text
     assert "1.5 can0 100 g1/r1 gap <late>" in text
     assert "2 scheduled g1/r1, g1/r2 estop, until 4 s 2.5 can0 g1/r1 bus-off" in text

@@ -23,7 +23,7 @@ from echelon.role import Role, Stage
 from echelon.runner import MAX_BATCHES, Runner
 from echelon.session import Receive
 from echelon.sim.engine import Engine, make_role
-from echelon.sim.trace import TraceBuilder
+from echelon.sim.results.trace import TraceBuilder
 from echelon.wire import data_key, decode, encode, split
 
 RUN = "test"
@@ -170,7 +170,7 @@ def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: i
     network = Network()
     runners = [
         Runner(make_role(plan, one.index), plan, network.session(one.name), RUN, watched=True, virtual=True)
-        for one in plan.members
+        for one in plan.formation
     ]
     ended: list[int] = []
 
@@ -430,5 +430,5 @@ def test_keys_of_what_a_member_hears() -> None:
         subscribe=lambda keys, receive: heard.extend(keys), publisher=lambda key: SimpleNamespace(put=lambda data: None)
     )
     Runner(make_role(plan, plan.nodes[1].index), plan, session, RUN, watched=False, virtual=True)
-    g1 = [data_key(RUN, plan.members[child].path, Channel.STATE) for child in plan.nodes[1].children]
+    g1 = [data_key(RUN, plan.formation[child].path, Channel.STATE) for child in plan.nodes[1].children]
     assert heard == sorted([*g1, data_key(RUN, "", Channel.REFERENCE)])

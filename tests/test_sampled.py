@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,10 @@ from trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_ran
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.in_tree import BlockGains
 from echelon.controller.sampled import delay_margin, error_map, largest_stable_delay, spectral_radius, tick_gains
+from echelon.controller.trajectory import Line
 from echelon.plan import Array, Plan
-from echelon.sim.parts import REGISTRY, load
+from echelon.plugins import Part
+from echelon.sim.parts import load
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=30)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -42,7 +43,7 @@ def random_plan(tree, seed: int, T: float) -> Plan:
 def run(plan: Plan, delay_ticks: int, ticks: int) -> Array:
     """Returns |(e, T ė)| tick by tick of points that do exactly what the central law tells them, from old states."""
     T = plan.root.period_ns * 1e-9
-    rest = REGISTRY.make("trajectories", "line", {"velocity": (0.0, 0.0)}, Path())
+    rest = Part("line", {}, None, Line(velocity=(0.0, 0.0)))
     central, random = CentralLaw(replace(plan, trajectory=rest)), np.random.default_rng(1)
     x = central.transformation.backward(central.transformation.desired(np.zeros(2)))
     x, v = x + random.normal(size=x.shape), np.zeros_like(x)

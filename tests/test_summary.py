@@ -5,27 +5,36 @@ from math import exp, log, sqrt
 
 import numpy as np
 import pytest
-from synthetic import DECAY, FIELD, at_places, decaying, link_counts, of_states, with_states
+from synthetic import DECAY, FIELD, at_places, can_report, decaying, link_counts, of_states, run_facts, with_states
 
+from echelon.bridge.reports import BusEvent, BusReport, FindingReport, RefereeReport, ScheduledEvent
 from echelon.sim.can_lines import can_lines, can_reasons
-from echelon.sim.distances import distances
-from echelon.sim.measures import settling_ns
-from echelon.sim.summary import summarise, summary_text, write
-from echelon.sim.trace import Trace
+from echelon.sim.results.distances import distances
+from echelon.sim.results.measures import settling_ns
+from echelon.sim.results.records import Summary
+from echelon.sim.results.rendering import json_text, read_summary, write_summary
+from echelon.sim.results.summary import summarise, summary_text
+from echelon.sim.results.trace import Trace
 
 NO_CLAIMS = "claims=[]"
 MS = 1_000_000
 
 
-def summary_of(trace: Trace) -> dict:
-    return summarise(trace, [], {}, {})
+def record_of(trace: Trace) -> Summary:
+    return summarise(trace, [], None, run_facts())
 
 
-def strict(summary: dict) -> dict:
+def strict(summary: Summary) -> dict:
+    """Returns a summary as a strict reader of JSON gets it."""
+
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
 
-    return json.loads(json.dumps(summary, allow_nan=False), parse_constant=refuse)
+    return json.loads(json_text(summary), parse_constant=refuse)
+
+
+def summary_of(trace: Trace) -> dict:
+    return strict(record_of(trace))
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +43,13 @@ def run():
 
 
 @pytest.fixture(scope="module")
-def summary(run) -> dict:
-    can = {"frames": 12, "load_mean": np.float64(0.25), "peaks": np.array([1.0, np.inf])}
-    return summarise(run.trace, link_counts(run.plan), can, {"wall_time": 6.0, "real_time_factor": 2.0})
+def record(run) -> Summary:
+    return summarise(run.trace, link_counts(run.plan), can_report(), run_facts())
+
+
+@pytest.fixture(scope="module")
+def summary(record) -> dict:
+    return strict(record)
 
 
 def test_settling_is_the_first_instant_inside_the_band(run, summary):
@@ -221,14 +234,13 @@ def test_torques_are_measured_over_the_periods(run):
 
 def test_links_and_what_is_passed_in_are_fit_for_json(run, summary):
     first, second = summary["links"][:2]
-    assert first["source"] == run.plan.members[run.plan.links[0].source].name
+    assert first["source"] == run.plan.formation[run.plan.links[0].source].name
     assert first["sent"] == first["delivered"] + first["lost"] + first["in_flight"]
     assert (first["age_mean"], first["age_max"]) == (0.00250000025, 0.006)
     assert second["held"] == 0
-    assert summary["can"] == {"frames": 12, "load_mean": 0.25, "peaks": [1.0, None]}
+    assert (summary["can"]["frames"], summary["can"]["load_mean"], summary["can"]["timing"]) == (12, 0.25, None)
     assert summary["run"]["real_time_factor"] == 2.0
     assert summary["trace_digest"] == run.trace.digest()
-    assert strict(summary) == summary
 
 
 @pytest.mark.filterwarnings("error")
@@ -237,10 +249,11 @@ def test_links_and_what_is_passed_in_are_fit_for_json(run, summary):
 def test_a_state_that_is_not_finite_fails_and_stays_valid_json(run, value, field):
     states = [part.copy() for part in run.trace.states]
     states[2][40:, FIELD[field]] = value
-    summary = strict(summary_of(with_states(run.trace, states)))
+    record = record_of(with_states(run.trace, states))
+    summary = strict(record)
     assert not summary["verdict"]["holds"]
     assert summary["verdict"]["reasons"][0] == "g1/r3: a state is not finite from 0.04 s on"
-    assert "not finite" in summary_text(summary)
+    assert "not finite" in summary_text(record)
 
 
 @pytest.mark.filterwarnings("error")
@@ -248,43 +261,62 @@ def test_a_run_that_explodes_but_stays_finite_fails_its_claims(run):
     _, states = run.trace.common()
     states = states * np.exp(np.linspace(0, 700, len(states)))[:, None, None]
     assert np.isfinite(states).all()
-    summary = strict(summary_of(of_states(run.plan, run.trace.times_ns[0], states)))
+    record = record_of(of_states(run.plan, run.trace.times_ns[0], states))
+    summary = strict(record)
     assert [claim["holds"] for claim in summary["claims"]] == [False] * 3
     assert [claim["measured"] for claim in summary["claims"]] == [None] * 3
     assert summary["blocks"][0]["ise"] is None
-    assert "did not settle" in summary_text(summary)
+    assert "did not settle" in summary_text(record)
 
 
 def test_a_run_that_ended_early_fails(run):
     cut = [len(times) for times in run.trace.times_ns]
-    assert shortened(run.trace, [length - 1 for length in cut])["verdict"]["holds"]  # without its last instant
+    assert shortened(run.trace, [length - 1 for length in cut]).verdict.holds  # without its last instant
     for lengths, words in (
         ([length - 2 for length in cut], "every robot ended early"),
         ([cut[0] - 5000, *cut[1:]], "g1/r2 at 7 s of 12 s"),
         ([*cut[:-1], 0], "g3/r9 before it began"),
         ([0] * len(cut), "every robot ended early, the first g1/r2 before it began"),
     ):
-        summary = strict(shortened(run.trace, lengths))
+        record = shortened(run.trace, lengths)
+        summary = strict(record)
         assert not summary["verdict"]["holds"]
         assert words in " ".join(summary["verdict"]["reasons"])
-        assert "FAILS" in summary_text(summary)
+        assert "FAILS" in summary_text(record)
 
 
-def shortened(trace: Trace, lengths: list[int]) -> dict:
+def shortened(trace: Trace, lengths: list[int]) -> Summary:
     pairs = zip(trace.times_ns, trace.states, lengths, strict=True)
     times, states = zip(*((times[:n], states[:n]) for times, states, n in pairs), strict=True)
-    return summary_of(Trace(trace.plan, times, states))
+    return record_of(Trace(trace.plan, times, states))
 
 
-def test_what_is_written_reads_back(summary, tmp_path):
-    write(summary, tmp_path / "summary.json")
-    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == summary
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        write({"value": float("nan")}, tmp_path / "other.json")
+def test_what_is_written_reads_back_as_the_same_record(record, tmp_path):
+    write_summary(record, tmp_path / "summary.json")
+    assert read_summary(tmp_path / "summary.json") == record
 
 
-def test_the_text_says_what_matters(summary):
-    text = summary_text(summary)
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: text[:100], "Invalid JSON"),
+        (lambda text: "", "Invalid JSON"),
+        (lambda text: "[]", "Input should be an object"),
+        (lambda text: text.replace('"seed": 1', '"seed": "one"'), "seed: "),
+        (lambda text: text.replace('"holds"', '"holdz"', 1), "verdict.holds: Field required"),
+    ],
+)
+def test_a_damaged_summary_is_one_line(record, tmp_path, change, says):
+    path = tmp_path / "summary.json"
+    path.write_text(change(json_text(record)), encoding="utf-8")
+    with pytest.raises(ValueError, match="is no summary that can be read") as caught:
+        read_summary(path)
+    assert says in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_the_text_says_what_matters(record, summary):
+    text = summary_text(record)
     assert text.startswith("paper: HOLDS")
     for words in ("intra within 5 % by 0.1 s: 0.06 s, holds", "2 lost", "0.006 s", "2 times real time"):
         assert words in text
@@ -292,14 +324,14 @@ def test_the_text_says_what_matters(summary):
 
 
 def test_what_was_on_schedule_and_who_went_bus_off_is_told():
-    buses = [
-        {"lost": 3, "destroyed": 2, "events": [{"time": 2.5, "node": 0, "who": "bridge", "event": "bus-off"}]},
-        {"lost": 1, "destroyed": 0, "events": [{"time": 2.6, "node": 0, "who": "bridge", "event": "recovered"}]},
-    ]
-    scheduled = [{"time": 2.0, "until": None, "what": "estop", "whom": ["g1/r1"]}]
-    finding = {"time": 2.5, "bus": "can0", "id": "100", "kind": "gap", "text": "late", "robot": "g1/r1"}
-    referee = {"frames": 7, "kinds": {"gap": 1}, "findings": [finding]}
-    can = {"frames": 7, "path": "closed", "buses": buses, "scheduled": scheduled, "referee": referee}
+    buses = (
+        BusReport("can0", 500_000, 0.1, lost=3, destroyed=2, events=(BusEvent(2.5, 0, "bridge", "bus-off"),)),
+        BusReport("can1", 500_000, 0.1, lost=1, events=(BusEvent(2.6, 0, "bridge", "recovered"),)),
+    )
+    scheduled = (ScheduledEvent(2.0, None, "estop", ("g1/r1",)),)
+    finding = FindingReport(2.5, "can0", "100", "gap", "late", "g1/r1")
+    referee = RefereeReport(7, 0, {"gap": 1}, (finding,), {})
+    can = can_report(frames=7, path="closed", buses=buses, scheduled=scheduled, referee=referee)
     lines = [" ".join(line.split()) for line in can_lines(can)]
     assert lines[0].startswith("CAN 7 frames, 4 lost, 2 destroyed and sent again")
     assert lines[1:3] == ["events 2 s estop", "bus-off bridge at 2.5 s"]

@@ -13,7 +13,7 @@ import pytest
 from runs import descendants, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, trace_of, until
 
 from echelon.plan import Plan
-from echelon.sim.joining import ProcessSpec
+from echelon.sim.contract import ProcessSpec
 from echelon.sim.recording import read_trace, recover
 from echelon.sim.supervisor import Outcome, Progress, Supervisor
 
@@ -116,7 +116,7 @@ def test_wall_clock_gives_the_same_when_nothing_is_late(tmp_path: Path) -> None:
     plan = plan_of("lab", "duration=0.5", "periods.acceleration=0.05", "periods.torque=0.01")
     outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
     assert outcome.failure is None
-    runners = [result.runner for result in outcome.results if result.runner]
+    runners = [result.runner for result in outcome.processes if result.runner]
     assert len(runners) == 13
     if not sum(runner.late for runner in runners):
         assert outcome.trace.digest() == trace_of(plan).digest()
@@ -184,7 +184,7 @@ def test_a_process_that_stands_still_for_a_while_costs_only_time(
     assert outcome.failure is None, notes
     assert any(f"for {name}" in note for note in notes)
     assert outcome.trace.digest() == trace_of(plan).digest()
-    assert outcome.can["frames"] == 9 * 3000
+    assert outcome.can.frames == 9 * 3000
 
 
 def test_ctrl_c_during_start_up_ends_without_a_traceback(tmp_path: Path) -> None:

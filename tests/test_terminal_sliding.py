@@ -16,8 +16,8 @@ from trees import ROBOT, plan_of, scenario
 
 from echelon.controller.laws import Block, TerminalSliding
 from echelon.plan import Array
-from echelon.sim.blocks import block_series
 from echelon.sim.parts import REGISTRY
+from echelon.sim.results.blocks import block_series
 
 
 def least(gamma: float, beta: float) -> float:

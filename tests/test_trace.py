@@ -9,7 +9,7 @@ import pytest
 from invented import invented, paper
 
 from echelon.messages import STATE_FIELDS, Channel
-from echelon.sim.trace import Digest, Trace, TraceBuilder
+from echelon.sim.results.trace import Digest, Trace, TraceBuilder
 
 FIELDS = len(STATE_FIELDS)
 

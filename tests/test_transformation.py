@@ -154,7 +154,7 @@ def test_robots_below_a_node_are_those_whose_parents_lead_to_it(tree):
         for robot in plan.robots:
             above: int | None = robot.parent
             while above is not None and above != node.index:
-                above = plan.members[above].parent
+                above = plan.formation[above].parent
             if above == node.index:
                 below.append(robot.index)
         assert list(subtree_robots(plan, node)) == below

@@ -14,7 +14,7 @@ from echelon.bridge.frame_message import TimedFrame, pack
 from echelon.messages import Channel, Message
 from echelon.sim import watchers
 from echelon.sim.recording import read_metadata, read_trace
-from echelon.sim.watchers import Reception, Recording
+from echelon.sim.watchers import Reception, RunRecorder
 from echelon.wire import encode, join
 
 TICKS = 6
@@ -43,7 +43,7 @@ def batches_by_source(messages: list[Message]) -> list[bytes]:
 
 def reception(inbox: Any) -> Reception:
     """Returns the reception of the paper's members."""
-    return Reception(inbox, range(len(paper().members)), paper())
+    return Reception(inbox, range(len(paper().formation)), paper())
 
 
 def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
@@ -54,7 +54,7 @@ def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
 def test_batches_come_out_in_order() -> None:
     messages = list(invented(paper(), TICKS))
     received = reception(Inbox(*[[each] for each in reversed(batches_by_source(messages))]))
-    out = [each for _ in range(len(paper().members)) for each in received.take(1.0)]
+    out = [each for _ in range(len(paper().formation)) for each in received.take(1.0)]
     out += [each for portion in received.drain(len(messages)) for each in portion]
     assert keys(out) == sorted(keys(messages))
     assert received.refused_count == 0
@@ -64,7 +64,11 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
     messages = list(invented(paper(), TICKS))
     good = batches_by_source(messages)
     size = messages[0].values.size
-    stranger = batch([Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))])
+    strangers = [Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))]
+    leader, root = paper().nodes[0], paper().root  # one has no nodes below it, the other no parent and no robots
+    for node, channel in ((leader, Channel.REFERENCE), (root, Channel.GROUP_STATE), (root, Channel.COMMAND)):
+        strangers.append(Message(channel, node.index, 0, 0, np.zeros(6)))
+    stranger = batch(strangers)
     odd = batch([Message(Channel.STATE, 1, 0, 0, np.zeros(2)), Message(Channel.STATE, 1, 0, 2**62, np.zeros(size))])
     received = reception(Inbox([b"\x01", join([b"\x01\x00"]), good[0][:-1], stranger, odd, *good[1:]]))
     out = [each for portion in received.drain(None) for each in portion]
@@ -74,11 +78,11 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
         "batch cut in a length": 1,
         "too short": 1,
         "batch cut in a message": 1,
-        "of nobody here": 2,
+        "of nobody here": 5,
         "wrong number of values": 1,
         "of another time": 1,
     }
-    assert received.refused_count == 7
+    assert received.refused_count == 10
 
 
 def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,20 +99,20 @@ def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.Monk
 
 
 def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
-    recording = Recording(tmp_path, paper(), "scenario", METADATA)
-    assert recording.progress()["states"] is None
+    recording = RunRecorder(tmp_path, paper(), "scenario", METADATA)
+    assert recording.progress().states is None
     messages = list(invented(paper(), TICKS))
     end_ns = messages[-1].time_ns
     timed = TimedFrame(end_ns, 0, 0, Frame(0x101, bytes(range(8))))
-    frames = Message(Channel.FRAMES, len(paper().members), 0, end_ns, pack([timed]))
+    frames = Message(Channel.FRAMES, len(paper().formation), 0, end_ns, pack([timed]))
     recording.add(messages)
     recording.add([])
     recording.add([frames])
     progress = recording.progress()
-    assert progress["time_ns"] == progress["states_ns"] == messages[-1].time_ns
-    assert (progress["messages"], progress["failure"]) == (len(messages) + 1, None)
+    assert progress.time_ns == progress.states_ns == messages[-1].time_ns
+    assert (progress.messages, progress.failure) == (len(messages) + 1, None)
     recording.close([])
-    result = recording.result()
-    assert (result["messages"], result["failure"]) == (len(messages) + 1, None)
-    assert read_trace(tmp_path / "run.mcap", paper()).digest() == result["trace"].digest()
+    result = recording.report()
+    assert (result.messages, result.failure) == (len(messages) + 1, None)
+    assert read_trace(tmp_path / "run.mcap", paper()).digest() == result.trace.digest()
     assert read_metadata(tmp_path / "run.mcap") == METADATA

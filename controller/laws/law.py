@@ -98,7 +98,7 @@ class Law(Plugin, ABC):
 
 def law_block(plan: Plan, block: BlockPlan, lead: float | None = None) -> Block:
     """Returns a block of a plan as a law sees it; with `lead` [periods] instead of the plan's, if given."""
-    node = plan.root if block.node is None else plan.members[block.node]
+    node = plan.root if block.node is None else plan.formation[block.node]
     K_1, K_2 = block.k1 / block.sigma**2, block.k2 / block.sigma
     K_1.flags.writeable = K_2.flags.writeable = False
     lead = plan.lead if lead is None else lead

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from bench.can import bus_rates
-from echelon.bridge.bridge import Bridge, Frame
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command, resolve_url
 from echelon.bridge.native.codec import NativeCodec, Torque
+from echelon.bridge.torque_mirror import Frame, TorqueMirror
 from echelon.sim.can_checks import check_interfaces, check_vcan
 from tests.runs import lab_dbc
 
@@ -52,7 +52,7 @@ def torques(step: int, robot: int) -> tuple[float, float]:
 
 def run(bus: Bus) -> list[Frame]:
     """Sends STEPS periods of all robots through a bridge."""
-    bridge = Bridge(ROBOTS, SCALE, 10_000_000)
+    bridge = TorqueMirror(ROBOTS, SCALE, 10_000_000)
     sent = []
     for step in range(STEPS):
         for robot in range(len(ROBOTS)):

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from echelon.bridge.bus import Bus, Received
-from echelon.layout import message_size
-from echelon.messages import Channel, Message
+from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan import Plan
 from echelon.wire import WireError, count_refusal, decode
 
@@ -24,7 +23,6 @@ class Mail:
     """Robots' torques as they come, in Zenoh's thread; with `wakes`, `fileno` becomes readable."""
 
     def __init__(self, plan: Plan, wakes: bool = True) -> None:
-        self._size = message_size(plan, 0, Channel.TORQUE)
         self._robots = len(plan.robots)
         self._messages: deque[Message] = deque()
         self._wakes = wakes
@@ -37,7 +35,7 @@ class Mail:
             message = decode(payload)
             if message.channel is not Channel.TORQUE or message.source >= self._robots:
                 raise WireError("of no robot")
-            if message.values.size != self._size:
+            if message.values.size != len(TORQUE_FIELDS):
                 raise WireError("wrong number of values")
         except WireError as error:
             count_refusal(self.refused, error.reason)

@@ -6,26 +6,27 @@ a robot that says nothing in a period has its last torque sent again, until the 
 
 from array import array
 from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from heapq import heappop, heappush
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from echelon.bridge.bus_load import BitCount
-from echelon.bridge.closed import ClosedStation
 from echelon.bridge.commander import Commander
 from echelon.bridge.frame import Frame
 from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
 from echelon.bridge.paced_bus import PacedBus
+from echelon.bridge.reports import BridgeProgress, CanReport, TorqueTimes
+from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.stations.closed import ClosedBridge
+from echelon.bridge.stations.waiting import Mail, RunClock, drained
 from echelon.link import Link
 from echelon.messages import Channel, Message
-from echelon.plan import on_wall_clock
-from echelon.session import Session
-from echelon.sim.joining import ProcessSpec, Result, StartError, meet, resources
-from echelon.sim.wall import PROGRESS_NS, Mail, RunClock, drained, wait_for
-from echelon.wire import count_refusal, data_key, encode, join, watch_key
+from echelon.plan import Plan, on_wall_clock
+from echelon.wire import count_refusal, encode, join
 
 FEEDBACK_SHARE: Final = 8
 """Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""
@@ -35,22 +36,31 @@ OTHER_NODE: Final = 1
 """What frames are noted as that others sent: which of them cannot be told from a frame."""
 
 
-class WallBridge:
-    """The bridge on a wall clock.  Times are run time, by `clock`, which is set when the run starts."""
+class WallBridge(Bridge):
+    """The bridge on a wall clock.  Times are run time, by `clock`, which is set when the run starts.
 
-    def __init__(self, spec: ProcessSpec, session: Session) -> None:
-        plan = on_wall_clock(spec.plan)
-        self.plan = plan
-        self.station = ClosedStation(
-            plan, spec.can_urls, Path(spec.folder), paired=True, role=Commander(plan, alone=True)
-        )
+    `tell_wheels` sends a payload to the robots, `watch` a batch to those who watch (None: nobody does).  Robots' torques go
+    into `mail`.  Raises ValueError or OSError if a bus or a file cannot be had."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        urls: Sequence[str],
+        folder: Path,
+        tell_wheels: Callable[[bytes], None],
+        watch: Callable[[bytes], None] | None,
+    ) -> None:
+        self.plan = plan = on_wall_clock(plan)
+        self._closed = ClosedBridge(plan, urls, folder, paired=True, role=Commander(plan, alone=True))
+        self.url = self._closed.url
         self.mail = Mail(plan)
-        self._role = self.station.role
+        self._role = self._closed.role
         self._buses = [
             PacedBus(bus, model, plan.can.watchdog_ns)
-            for bus, model in zip(self.station.buses, self._role.buses, strict=True)
+            for bus, model in zip(self._closed.buses, self._role.buses, strict=True)
         ]
-        self._period_ns = plan.stations[0].period_ns
+        assert plan.bridge is not None
+        self._period_ns = plan.bridge.period_ns
         self._last: list[Message | None] = [None] * len(plan.robots)
         self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period that a robot's torque was last sent in
         self._cycle = -plan.can.bring_up_ns // self._period_ns
@@ -58,11 +68,11 @@ class WallBridge:
         self._frames: list[TimedFrame] = []
         self._bits = [BitCount() for _ in plan.can.buses]
         self._logged_ns = -1 << 62
-        everyone = plan.everyone
+        all_roles = plan.all_roles
         self._links = [
-            Link(link, plan.seed, everyone[link.source].name, everyone[link.receiver].name)
+            Link(link, plan.seed, all_roles[link.source].name, all_roles[link.receiver].name)
             for link in plan.links
-            if link.channel is Channel.TORQUE and link.receiver == plan.stations[0].index
+            if link.channel is Channel.TORQUE and link.receiver == plan.bridge.index
         ]
         self._flying: list[tuple[int, int, int, Message]] = []
         self.link_lost = 0
@@ -72,9 +82,8 @@ class WallBridge:
         self.latencies = array("q")
         self.clock = RunClock()
         self.in_time = 0
-        session.subscribe([data_key(spec.run, robot.path, Channel.TORQUE) for robot in plan.robots], self.mail.receive)
-        self._wheels = session.publisher(data_key(spec.run, plan.stations[0].path, Channel.WHEELS))
-        self._watch = session.publisher(watch_key(spec.run, "bridge", "bridge")) if spec.watched else None
+        self._messages = 0
+        self._tell_wheels, self._watch = tell_wheels, watch
 
     @property
     def due_ns(self) -> int:
@@ -87,11 +96,24 @@ class WallBridge:
         return min([at_ns, *(due_ns for bus in self._buses if (due_ns := bus.due_ns) is not None)])
 
     @property
-    def listens(self) -> bool:
-        """True while robots are to be told what drives report, and where every frame is time that the bus is taken."""
-        return self._told < self._cycle - 1 or self.plan.can.paced
+    def sources(self) -> list[Any]:
+        """What to wait for, for `select`.  What drives say is of use when a period has ended; until then it can wait for the
+        next torque, except where the model of a bus must know of every frame."""
+        listens = self._told < self._cycle - 1 or self.plan.can.paced
+        return [self.mail, *(self._closed.buses if listens else ())]
 
-    def torques(self) -> None:
+    def serve(self) -> None:
+        """Does what there is to do now."""
+        self._frames_from_buses(self.clock.now())
+        self._torques()
+        self._carry(self.clock.now())
+        self._pass_time(self.clock.now())
+
+    def take(self, messages: Sequence[Message]) -> list[Message]:
+        """Does nothing: torques come through `mail`."""
+        return []
+
+    def _torques(self) -> None:
         """Takes robots' torques as their links let them arrive, and sends them."""
         for message in self.mail.take():
             now_ns = self.clock.now()
@@ -121,9 +143,9 @@ class WallBridge:
             if message.sequence >= now_ns // self._period_ns - 1:  # or else newer ones are on their way
                 self._send_robot(now_ns, message.source, message.sequence, message.time_ns)
 
-    def frames(self, now_ns: int) -> None:
+    def _frames_from_buses(self, now_ns: int) -> None:
         """Takes what has come from the buses."""
-        for number, bus in enumerate(self.station.buses):
+        for number, bus in enumerate(self._closed.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
                 came_ns = min(self.clock.of(received.time_ns), now_ns)  # as the kernel saw it
@@ -132,7 +154,7 @@ class WallBridge:
                     self._role.receive(now_ns, number, frame)
                 self._note(TimedFrame(came_ns, number, OTHER_NODE, frame))
 
-    def pass_time(self, now_ns: int) -> None:
+    def _pass_time(self, now_ns: int) -> None:
         """Does what is due: a new period, and telling robots of the one that ended."""
         if now_ns >= self._cycle * self._period_ns:
             # After a standstill the periods that are over stay without frames; a burst of them would help nobody.
@@ -145,7 +167,7 @@ class WallBridge:
             for bus, frames in self._role.bus_frames(now_ns):
                 for frame in frames:
                     self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
-            self.carry(now_ns)
+            self._carry(now_ns)
             self._flush()
             self._cycle += 1
         at = self._cycle - 1
@@ -155,11 +177,11 @@ class WallBridge:
             if late or self._role.reported_since(begun_ns - self._period_ns // 2):
                 self._told = at
                 payload = encode(self._role.wheels(begun_ns))
-                self._wheels.put(payload)
+                self._tell_wheels(payload)
                 if self._watch is not None:
-                    self._watch.put(join([payload]))
+                    self._watch(join([payload]))
 
-    def carry(self, now_ns: int) -> None:
+    def _carry(self, now_ns: int) -> None:
         """Lets buses take what they can have taken by now."""
         for number, bus in enumerate(self._buses):
             for queued_ns, _, _, frame in bus.run(now_ns):
@@ -172,35 +194,48 @@ class WallBridge:
                     self.latencies.append(latency_ns)
                     self.in_time += latency_ns < self._period_ns
 
-    def stop(self, now_ns: int) -> None:
+    def stop(self) -> None:
         """Takes the torque away from all wheels and disables their drives."""
+        now_ns = self.clock.now()
+        self._frames_from_buses(now_ns)
         self._flush()
-        self.station.stop_wheels(now_ns)
+        self._closed.stop_at(now_ns)
 
-    def result(self) -> dict[str, Any]:
-        """Returns what there is to say of the bridge; latencies [s] are from a robot's state to its torque frames."""
-        result = self.station.result()
-        for row, load in zip(result["buses"], self._loads(), strict=True):
-            row["load"] = load
-            if not self.plan.can.paced:
-                row["identifiers"] = {}  # how long its frames take the bus alone knows
-        result["load_mean"] = max(row["load"] for row in result["buses"])
+    def close(self) -> None:
+        """Closes log and buses."""
+        self._closed.close()
+
+    def progress(self) -> BridgeProgress:
+        """Returns how it stands."""
+        return replace(self._closed.progress(), load=max(self._loads()))
+
+    def report(self) -> CanReport:
+        """Returns what became of frames and torques."""
+        report = self._closed.report()
+        buses = [replace(bus, load=load) for bus, load in zip(report.buses, self._loads(), strict=True)]
+        if not self.plan.can.paced:  # how long its frames take the bus alone knows
+            buses = [replace(bus, identifiers={}) for bus in buses]
+        return replace(
+            report,
+            buses=tuple(buses),
+            load_mean=max(bus.load for bus in buses),
+            torque=self._torque_times(),
+            refused={**report.refused, **self.mail.refused},
+            messages=self._messages,
+        )
+
+    def _torque_times(self) -> TorqueTimes:
         latencies = np.array(self.latencies) / 1e9
-        result["torque"] = {
-            "periods": len(self._last) * max(0, min(self._cycle, self.plan.duration_ns // self._period_ns + 1)),
-            "came": self.came,
-            "in_time": self.in_time,
-            "latency_median": float(np.median(latencies)) if len(latencies) else None,
-            "latency_p99": float(np.percentile(latencies, 99)) if len(latencies) else None,
-            "latency_max": float(latencies.max()) if len(latencies) else None,
-        }
-        result["refused_messages"] = self.mail.refused
-        result["torque"]["lost_on_links"] = self.link_lost
-        return result
-
-    def progress(self) -> dict[str, Any]:
-        """Returns what a live table shows."""
-        return self.station.progress() | {"load": max(self._loads())}
+        cycles = max(0, min(self._cycle, self.plan.duration_ns // self._period_ns + 1))
+        return TorqueTimes(
+            periods=len(self._last) * cycles,
+            came=self.came,
+            in_time=self.in_time,
+            latency_median=float(np.median(latencies)) if len(latencies) else None,
+            latency_p99=float(np.percentile(latencies, 99)) if len(latencies) else None,
+            latency_max=float(latencies.max()) if len(latencies) else None,
+            lost_on_links=self.link_lost,
+        )
 
     def _loads(self) -> list[float]:
         """Returns the share of each bus that its frames took since drives are brought up."""
@@ -222,7 +257,7 @@ class WallBridge:
             # What was wanted is on the bus with the last of its frames.
             key = bus, frames[-1].can_id
             self._awaited.setdefault(key, deque(maxlen=self.plan.can.queue)).append((now_ns, state_ns))
-        self.carry(now_ns)
+        self._carry(now_ns)
 
     def _note(self, timed: TimedFrame) -> None:
         self._frames.append(timed)
@@ -236,42 +271,10 @@ class WallBridge:
         self._frames.sort(key=lambda timed: timed.time_ns)
         self._frames = [timed._replace(time_ns=max(timed.time_ns, self._logged_ns)) for timed in self._frames]
         self._logged_ns = self._frames[-1].time_ns
-        self.station.log(self._frames)
+        self._closed.log(self._frames)
         if self._watch is not None:
             at_ns = self._frames[-1].time_ns
-            message = Message(Channel.FRAMES, self.station.index, self.station.messages, at_ns, pack(self._frames))
-            self.station.messages += 1
-            self._watch.put(join([encode(message)]))
+            message = Message(Channel.FRAMES, self._closed.index, self._messages, at_ns, pack(self._frames))
+            self._messages += 1
+            self._watch(join([encode(message)]))
         self._frames = []
-
-
-def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The bridge process of a run on a wall clock."""
-    try:
-        bridge = WallBridge(spec, session)
-    except (ValueError, OSError) as error:
-        raise StartError(str(error)) from None
-    control.send(("bus", bridge.station.url))
-    clock = bridge.clock = RunClock(meet(spec, session, control))
-    said_ns = -1 << 62
-    while True:
-        # What drives say is of use when a period has ended; until then it can wait for the next torque.
-        buses = bridge.station.buses if bridge.listens else ()
-        wait_for([control, bridge.mail, *buses], bridge.due_ns - clock.now())
-        bridge.frames(clock.now())
-        bridge.torques()
-        bridge.carry(clock.now())
-        bridge.pass_time(clock.now())
-        now_ns = clock.now()
-        if now_ns - said_ns >= PROGRESS_NS:
-            said_ns = now_ns
-            control.send(("progress", bridge.progress()))
-        if control.poll():
-            control.recv()
-            break
-    bridge.frames(clock.now())
-    bridge.stop(clock.now())
-    bridge.station.close()
-    cpu_s, resident = resources()
-    control.send(("done", Result(spec.name, cpu_s, resident, extra=bridge.result())))
-    control.recv()

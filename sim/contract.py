@@ -1,17 +1,20 @@
-"""What supervisor and processes of a run agree on: what a process is told, how it joins, what it leaves behind."""
+"""What supervisor and processes of a run agree on: what a process is told at its start, how it joins, how it ends."""
 
 import os
 import resource
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from echelon.link import LinkCounts
 from echelon.plan import Plan
 from echelon.runner import RunnerCounts
 from echelon.session import Session
+from echelon.sim.to_process import Finish, Start
+from echelon.sim.to_supervisor import Done, Ready, Report
 from echelon.wire import SCHEMA_VERSION, token_key
 
 READY_TIMEOUT_S: Final = 20.0
@@ -42,16 +45,8 @@ class ProcessSpec:
     metadata: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Result:
-    """What a process leaves behind."""
-
-    name: str
-    cpu_s: float
-    resident_bytes: int
-    runner: RunnerCounts | None = None
-    links: tuple[LinkCounts, ...] = ()
-    extra: dict[str, Any] = field(default_factory=dict)
+Body = Callable[[ProcessSpec, Session, Connection], None]
+"""What a process does once it has its session."""
 
 
 class StartError(Exception):
@@ -72,9 +67,30 @@ def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
         others = {key.split("/")[3] for key in tokens.alive()} - {str(SCHEMA_VERSION)}
         note = f"; some here speak schema version {', '.join(sorted(others))}, not {SCHEMA_VERSION}" if others else ""
         raise StartError(f"not there after {READY_TIMEOUT_S:g} s: {', '.join(wanted[key] for key in missing)}{note}")
-    control.send(("ready",))
-    _, start_ns = control.recv()
-    return int(start_ns)
+    control.send(Ready())
+    told = control.recv()
+    assert isinstance(told, Start)
+    return told.start_ns
+
+
+def hear_finish(control: Connection) -> Finish | None:
+    """Returns the order to finish if it has come."""
+    told = control.recv() if control.poll() else None
+    return told if isinstance(told, Finish) else None
+
+
+def finish(
+    spec: ProcessSpec,
+    control: Connection,
+    runner: RunnerCounts | None = None,
+    links: Sequence[LinkCounts] = (),
+    report: Report | None = None,
+) -> None:
+    """Says what this process counted, and waits until everyone is done: a link that closes early would look like a death to
+    its neighbours."""
+    cpu_s, resident = resources()
+    control.send(Done(spec.name, cpu_s, resident, runner, tuple(links), report))
+    control.recv()
 
 
 def resources() -> tuple[float, int]:

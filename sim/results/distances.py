@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.sim.blocks import POSITION
-from echelon.sim.trace import Trace
+from echelon.sim.results.blocks import POSITION
+from echelon.sim.results.trace import Trace
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""The bridge where torque is mirrored: wheel torques in, CAN frames out, and what there is to know about them. Pure.
+"""Torque that is mirrored: wheel torques in, CAN frames out, counted robot by robot. Pure.
 
 Each robot sends its torques once per acceleration period, and each becomes one frame at once; nothing is held back, so
 torques in the order (time, robot) give frames in that order. What must not reach a wheel becomes a frame with zero
@@ -7,15 +7,14 @@ does not let pass.
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
 
 from echelon.bridge.bus_load import BitCount
 from echelon.bridge.envelope import Envelope
 from echelon.bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
+from echelon.bridge.reports import WheelsReport
 from echelon.can_plan import EnvelopePlan
 
 Frame = tuple[int, bytes]
@@ -33,10 +32,10 @@ class Stop(StrEnum):
 
 @dataclass(slots=True)
 class RobotCounts:
-    """What the bridge saw of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
+    """What was seen of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
 
     frames: int = 0
-    stopped: dict[StrEnum, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
+    stopped: dict[str, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
     repeated: int = 0  # torques for a period that had its frame: no frame
     skipped: int = 0  # periods without torques between two that had them
     clipped: int = 0  # frames in which a torque was cut to the range of the frame
@@ -44,9 +43,10 @@ class RobotCounts:
     smallest: tuple[float, float] = (math.inf, math.inf)
     largest: tuple[float, float] = (-math.inf, -math.inf)
     last_ns: int | None = None  # the newest torques turned into a frame
+    bits: BitCount = field(default_factory=BitCount)  # that its frames would take on a real bus
 
 
-class Bridge:
+class TorqueMirror:
     """Turns torques into frames: native ones, or those of another protocol.
 
     Parameters: the robots' path names in the order of their numbers, the torque scale [N m per bit], the acceleration
@@ -54,7 +54,6 @@ class Bridge:
     robot. Raises ValueError for more robots than identifiers, or a scale or period that is not positive."""
 
     __slots__ = (
-        "_bits",
         "_codec",
         "_counters",
         "_envelopes",
@@ -86,7 +85,6 @@ class Bridge:
         self._makers = makers or {}
         self.counts = [RobotCounts() for _ in robots]
         self.frames = 0
-        self._bits = BitCount()
 
     def encode(
         self, time_ns: int, robot: int, tau_right: float, tau_left: float, saturated: bool = False
@@ -94,7 +92,7 @@ class Bridge:
         """The frame for the torques [N m] that robot number `robot` commands at `time_ns`.
 
         Torques not finite, or older than the last ones, give a frame that stops the robot's drives; a second set of
-        torques for one instant gives none. Raises IndexError for a robot the bridge does not have."""
+        torques for one instant gives none. Raises IndexError for a robot it does not have."""
         counts = self.counts[robot]
         last = counts.last_ns
         if last is not None and time_ns <= last:
@@ -126,7 +124,7 @@ class Bridge:
     def stop(self, robot: int, why: StrEnum = Stop.REQUESTED) -> list[Frame]:
         """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
         counts = self.counts[robot]
-        counts.stopped[why] = counts.stopped.get(why, 0) + 1
+        counts.stopped[why.value] = counts.stopped.get(why.value, 0) + 1
         if self._envelopes and counts.last_ns is not None:
             self._envelopes[robot].stop(counts.last_ns)
         if robot in self._makers:
@@ -137,40 +135,31 @@ class Bridge:
     def _send(self, robot: int, data: bytes) -> list[Frame]:
         can_id = frame_id(robot)
         self._counters[robot] += 1
-        self.counts[robot].frames += 1
+        counts = self.counts[robot]
+        counts.frames += 1
         self.frames += 1
-        self._bits.add(can_id, data)
+        counts.bits.add(can_id, data)
         return [(can_id, data)]
 
     def _send_made(self, robot: int, frames: list[Frame]) -> list[Frame]:
-        self.counts[robot].frames += len(frames)
+        counts = self.counts[robot]
+        counts.frames += len(frames)
         self.frames += len(frames)
         for can_id, data in frames:
-            self._bits.add(can_id, data)
+            counts.bits.add(can_id, data)
         return frames
 
-    def stopped(self) -> Counter[str]:
-        """How many torques did not reach a wheel, by reason, over all robots."""
-        return sum((Counter(counts.stopped) for counts in self.counts), Counter[str]())
-
-    @property
-    def bits(self) -> int:
-        """Bits that all frames so far would take on a real bus, stuff bits and interframe space included."""
-        return self._bits.bits
-
-    def summary(self) -> dict[str, Any]:
-        """All counts, ready for JSON: totals, and one entry for each robot under its path name."""
-        robots = {}
-        for name, counts in zip(self._names, self.counts, strict=True):
-            commanded = counts.smallest[0] <= counts.largest[0]
-            robots[name] = {
-                "frames": counts.frames,
-                "stopped": {why.value: number for why, number in sorted(counts.stopped.items())},
-                "repeated": counts.repeated,
-                "skipped": counts.skipped,
-                "clipped": counts.clipped,
-                "saturated": counts.saturated,
-                "torque_min": list(counts.smallest) if commanded else None,
-                "torque_max": list(counts.largest) if commanded else None,
-            }
-        return {"frames": self.frames, "bits": self.bits, "torque_limit": self._codec.limit, "robots": robots}
+    def report(self, robot: int, protocol: str) -> WheelsReport:
+        """Returns the counts of a robot whose drives speak `protocol`."""
+        counts = self.counts[robot]
+        commanded = (*counts.smallest, *counts.largest) if counts.smallest[0] <= counts.largest[0] else (0.0,)
+        return WheelsReport(
+            protocol=protocol,
+            commands=counts.frames,
+            stopped=dict(sorted(counts.stopped.items())),
+            largest=max(map(abs, commanded)),
+            clipped=counts.clipped,
+            saturated=counts.saturated,
+            repeated=counts.repeated,
+            skipped=counts.skipped,
+        )

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan import Plan
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True, slots=True)
 class Trace:

@@ -4,8 +4,17 @@ from collections.abc import Iterable
 from typing import Final
 
 from echelon.messages import Message
+from echelon.plan import Plan
 
 _BEFORE_ALL_NS: Final = -(1 << 62)
+
+
+def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
+    """Returns the numbers of those whose messages are recorded: robots and nodes, then the bridge, then the drives, which say
+    something of their own only in virtual time."""
+    if not plan.can.closed:
+        return range(len(plan.formation) + has_bus)
+    return range(len(plan.all_roles) if virtual else len(plan.formation) + 1)
 
 
 class TimeOrder:

@@ -9,7 +9,7 @@ from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan import BlockPlan
-from echelon.sim.trace import Trace
+from echelon.sim.results.trace import Trace
 
 Array = NDArray[np.float64]
 POSITION = field_index(STATE_FIELDS, "x", "y")

@@ -1,0 +1,135 @@
+"""The bridge on a closed torque path: its role, its buses, can.log and the DBC."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from echelon.bridge.bus import Bus, open_bus
+from echelon.bridge.bus_url import listen_command
+from echelon.bridge.buses import bus_report, scheduled
+from echelon.bridge.canlog import CanLog
+from echelon.bridge.commander import Commander
+from echelon.bridge.fit import plan_fit
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, frames_of
+from echelon.bridge.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.reports import BridgeProgress, CanReport, WheelsReport, stopped_text
+from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.stations.rail import Rail, on_bus
+from echelon.messages import Channel, Message
+from echelon.plan import Plan
+from echelon.role import Stage
+
+LOG: Final = "can.log"
+
+
+class ClosedBridge(Bridge):
+    """The bridge of a plan whose torque path is closed, on the buses at `urls`; without any, frames go into the log alone.
+
+    `paired`: the drives are on the same buses, in another process, and `stages` go over the buses; otherwise frames are only
+    shown there, by `take`.  Raises ValueError or OSError if a bus or a file cannot be had.
+    """
+
+    def __init__(
+        self, plan: Plan, urls: Sequence[str], folder: Path, *, paired: bool, role: Commander | None = None
+    ) -> None:
+        self.plan = plan
+        self.role = role or Commander(plan)
+        self.index = self.role.index
+        self.buses: list[Bus] = [open_bus(url) for url in urls]
+        self.urls = [bus.url for bus in self.buses]
+        self.url = ", ".join(self.urls) or "nowhere"
+        self.rail = Rail(self.buses)
+        for bus, name in enumerate(dbc_names(plan)):
+            (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
+        # The log begins with the bringing up of the drives; run time 0 is `can.bring_up` later.
+        self._names = [bus.name for bus in plan.can.buses]
+        self._log = CanLog(folder / LOG, self._names[0], plan.can.bring_up_ns)
+        self.frames = 0
+        self._robots: dict[str, WheelsReport] = {}
+        self.stages: tuple[Stage, ...] = self.role.stages
+        if self.buses and paired:
+            self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.log)
+
+    def take(self, messages: Sequence[Message]) -> list[Message]:
+        """Shows the frames that its own role put on the buses.  Returns nothing: those who watch have the role's messages."""
+        for message in messages:
+            if message.channel is Channel.FRAMES and message.source == self.index:
+                frames = frames_of(message)
+                if self.buses:
+                    self.rail.put(frames)
+                self.log(frames)
+        return []
+
+    def log(self, frames: Sequence[TimedFrame]) -> None:
+        """Notes frames in can.log."""
+        wall_ns, write, names = time.monotonic_ns(), self._log.write, self._names
+        for time_ns, bus, _, (can_id, data, remote) in frames:
+            write(time_ns, can_id, data, wall_ns, names[bus], remote)
+        self.frames += len(frames)
+
+    def stop(self) -> None:
+        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends."""
+        self.stop_at(self.role.next_ns)
+
+    def stop_at(self, time_ns: int) -> None:
+        """Stops at an instant of run time: at once, and past the models of buses that are as slow as real ones."""
+        self._robots = self.role.reports()
+        frames = [
+            TimedFrame(time_ns, robot.robot.drive.bus, BRIDGE_NODE, frame)
+            for robot in self.role.robots
+            for frame in robot.host.stop(time_ns)
+        ]
+        for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
+            self.buses[bus].send(can_id, data, time_ns, remote)
+        self.log(frames)
+
+    def interrupt(self) -> None:
+        """Waits no more for a bus that takes no frames."""
+        self.rail.stopping.set()
+
+    def close(self) -> None:
+        """Closes log and buses."""
+        self._log.close()
+        for bus in self.buses:
+            bus.close()
+
+    def progress(self) -> BridgeProgress:
+        """Returns how it stands."""
+        return BridgeProgress(
+            url=self.url,
+            load=max(bus.load for bus in self.role.buses),
+            frames=self.frames,
+            stopped=stopped_text([robot.stopped for robot in self.role.robots]),
+            faults=tuple(f"{robot.robot.name} {robot.host.fault}" for robot in self.role.robots if robot.host.fault),
+            note=self.rail.waiting,
+        )
+
+    def report(self) -> CanReport:
+        """Returns what became of frames and torques; robots are as they were before `stop`."""
+        fit = plan_fit(self.plan)
+        buses = tuple(
+            bus_report(self.plan, number, self.role.buses[number], bus.responses_ns) for number, bus in enumerate(fit)
+        )
+        return CanReport(
+            path="closed",
+            timing=self.plan.can.timing,
+            url=self.url,
+            listen="; ".join(command for url in self.urls if (command := listen_command(url))),
+            torque_scale=self.plan.can.torque_scale,
+            log_start=-self.plan.can.bring_up_ns / 1e9,
+            frames=self.frames,
+            load_mean=max(bus.load for bus in buses),
+            fit=tuple(bus.lines[0] for bus in fit),
+            advice=tuple(way for bus in fit for way in bus.advice),
+            buses=buses,
+            scheduled=scheduled(self.plan),
+            sent=sum(bus.counts.sent for bus in self.buses),
+            failed=sum(bus.counts.failed for bus in self.buses),
+            dropped=sum(bus.counts.dropped for bus in self.buses),
+            log_lost=self._log.counts.lost,
+            log_error=str(self._log.error) if self._log.error else None,
+            robots=self._robots or self.role.reports(),
+            foreign=self.rail.foreign,
+            refused=dict(self.role.refused),
+        )

@@ -1,0 +1,146 @@
+"""The bridge where torque is mirrored: robots' states in; frames out on the bus, in can.log, and as copies to the recorder."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from echelon.bridge.bus import open_bus
+from echelon.bridge.bus_load import bus_load
+from echelon.bridge.bus_url import listen_command
+from echelon.bridge.buses import scheduled
+from echelon.bridge.canlog import CanLog
+from echelon.bridge.fit import plan_fit
+from echelon.bridge.frame_message import BRIDGE_NODE, add_words
+from echelon.bridge.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.protocols import torque_frames
+from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped_text
+from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.torque_mirror import TorqueMirror
+from echelon.messages import STATE_FIELDS, Channel, Message
+from echelon.plan import Plan
+
+TAU_RIGHT: Final = STATE_FIELDS.index("tau_right")
+TAU_LEFT: Final = STATE_FIELDS.index("tau_left")
+SATURATED: Final = STATE_FIELDS.index("saturated")
+
+
+class MirrorBridge(Bridge):
+    """A torque mirror with its buses, its log and its DBC.  Raises ValueError or OSError if a bus or a file cannot be had."""
+
+    def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
+        self._plan = plan
+        self._mirror = TorqueMirror(
+            [robot.path for robot in plan.robots],
+            plan.can.torque_scale,
+            [robot.period_ns for robot in plan.robots],
+            [robot.envelope for robot in plan.robots],
+            {robot.index: torque_frames(robot) for robot in plan.robots if robot.drive.protocol != "native"},
+        )
+        self._buses = [open_bus(url) for url in urls]
+        self.url = ", ".join(bus.url for bus in self._buses)
+        for number, name in enumerate(dbc_names(plan)):
+            (folder / name).write_text(plan_dbc(plan, number), encoding="utf-8")
+        self._log = CanLog(folder / "can.log", plan.can.buses[0].name, 0)
+        self._bus_of = [robot.drive.bus for robot in plan.robots]
+        self._names = [bus.name for bus in plan.can.buses]
+        self._source = len(plan.formation)
+        self._sequence = 0
+        self._time_ns = 0
+
+    def take(self, messages: Sequence[Message]) -> list[Message]:
+        """Sends the torques of robots' states; returns the frames as messages, one per instant.
+
+        The state at the start says nothing of torque: the first frame of a robot ends its first period.
+        """
+        copies: list[Message] = []
+        words: list[int] = []
+        buses, names, log, encode = self._buses, self._names, self._log, self._mirror.encode
+        wall_ns = time.monotonic_ns()
+        for channel, source, _, time_ns, values in messages:
+            if channel is not Channel.STATE or time_ns == 0:
+                continue
+            if time_ns != self._time_ns:
+                self._copy(words, copies)
+                self._time_ns = time_ns
+            frames = encode(
+                time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
+            )
+            number = self._bus_of[source]
+            for identifier, data in frames:
+                buses[number].send(identifier, data, time_ns)
+                log.write(time_ns, identifier, data, wall_ns, names[number])
+                add_words(words, time_ns, number, BRIDGE_NODE, identifier, data)
+        self._copy(words, copies)
+        return copies
+
+    def stop(self) -> None:
+        """Does nothing: mirrored frames turn no wheel."""
+
+    def flush(self) -> None:
+        """Hands what is logged to the operating system."""
+        self._log.flush()
+
+    def close(self) -> None:
+        """Closes log and buses."""
+        self._log.close()
+        for bus in self._buses:
+            bus.close()
+
+    def progress(self) -> BridgeProgress:
+        """Returns how it stands."""
+        return BridgeProgress(
+            url=self.url,
+            load=max(self._loads()),
+            frames=self._mirror.frames,
+            stopped=stopped_text([counts.stopped for counts in self._mirror.counts]),
+        )
+
+    def report(self) -> CanReport:
+        """Returns what became of frames and torques, and the load this would be on real buses."""
+        loads, fit = self._loads(), plan_fit(self._plan)
+        return CanReport(
+            path="mirror",
+            timing=None,
+            url=self.url,
+            listen="; ".join(command for bus in self._buses if (command := listen_command(bus.url))),
+            torque_scale=self._plan.can.torque_scale,
+            log_start=0.0,
+            frames=self._mirror.frames,
+            load_mean=max(loads),
+            fit=tuple(bus.lines[0] for bus in fit),
+            advice=tuple(way for bus in fit for way in bus.advice),
+            buses=tuple(
+                BusReport(bus.name, bus.bitrate, load) for bus, load in zip(self._plan.can.buses, loads, strict=True)
+            ),
+            scheduled=scheduled(self._plan),
+            sent=sum(bus.counts.sent for bus in self._buses),
+            failed=sum(bus.counts.failed for bus in self._buses),
+            dropped=sum(bus.counts.dropped for bus in self._buses),
+            log_lost=self._log.counts.lost,
+            log_error=str(self._log.error) if self._log.error else None,
+            robots={robot.name: self._mirror.report(robot.index, robot.drive.protocol) for robot in self._plan.robots},
+            messages=self._sequence,
+        )
+
+    def _loads(self) -> list[float]:
+        """Returns the share of each bus that its frames so far would take if it were real, in run time."""
+        frames, bits = [0] * len(self._names), [0] * len(self._names)
+        for bus, counts in zip(self._bus_of, self._mirror.counts, strict=True):
+            frames[bus] += counts.frames
+            bits[bus] += counts.bits.bits
+        if not self._time_ns:
+            return [0.0] * len(frames)
+        return [
+            bus_load(count * 1e9 / self._time_ns, bus.bitrate, total / max(count, 1))
+            for count, total, bus in zip(frames, bits, self._plan.can.buses, strict=True)
+        ]
+
+    def _copy(self, words: list[int], copies: list[Message]) -> None:
+        if words:
+            values = np.array(words, dtype="<u8").view(np.float64)
+            copies.append(Message(Channel.FRAMES, self._source, self._sequence, self._time_ns, values))
+            self._sequence += 1
+            words.clear()

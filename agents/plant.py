@@ -224,10 +224,18 @@ _HUGE: Final = 1e12
 
 
 def make_step(robot: RobotPlan) -> Step:
-    """Returns the step of the plant that a robot's plan names; one that is not built in has its answers checked."""
+    """Returns the step of the plant that a robot's plan names; one that is not built in has its answers checked.
+
+    Raises PartRunError if the plant cannot make it."""
     plant: Plant = robot.model.made
-    step = plant.step_of(robot)
-    return step if robot.model.is_own else _checked(step, f"{robot.model.use} of {robot.name}")
+    if robot.model.is_own:
+        return plant.step_of(robot)
+    who = f"{robot.model.use} of {robot.name}"
+    try:
+        step = plant.step_of(robot)
+    except Exception as error:
+        raise PartRunError(f"{who}: step_of raised {type(error).__name__}: {error}") from error
+    return _checked(step, who)
 
 
 def _checked(step: Step, who: str) -> Step:

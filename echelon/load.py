@@ -1,7 +1,7 @@
 """Reading a scenario: TOML, overrides, and mistakes explained in one line (file, key, value, what is allowed)."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from echelon.explain import explain, key_text, one_line, short
 from echelon.part_fields import PartContext
 from echelon.plan import Plan
 from echelon.planning import PlanError, make_plan
-from echelon.plugins import Registry
+from echelon.plugins import Registry, Source
 from echelon.scenario import Scenario
 
 
@@ -68,9 +68,11 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
         raise mistake("formation", "formation: groups are nested too deep") from None
 
 
-def effective_toml(scenario: Scenario) -> str:
-    """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario."""
-    return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True))
+def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None) -> str:
+    """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario.
+
+    `names` are other names for files of parts."""
+    return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True, context=names))
 
 
 def _table(text: str, name: str) -> dict[str, Any]:

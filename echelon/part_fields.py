@@ -9,14 +9,14 @@
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import BaseModel, PlainSerializer, PlainValidator, SerializationInfo, ValidationInfo, WithJsonSchema
 
 from echelon.explain import PartError
-from echelon.plugins import Part, Registry
+from echelon.plugins import Part, Registry, Source
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
@@ -105,16 +105,38 @@ def _by_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
     return validate
 
 
-def _written_inline(part: Part[Any]) -> dict[str, Any]:
-    if ":" in part.use:
-        return {"use": part.use, _PARAMETERS: dict(part.parameters)}
-    return {KIND: part.use, **part.parameters}
+def written_use(part: Part[Any], info: SerializationInfo) -> str:
+    """Returns how a scenario is to name a part: as it does, but for files that the context of pydantic, a mapping of sources,
+    gives other names to."""
+    names: Mapping[Source, str] = info.context or {}
+    if part.source is not None and part.source in names:
+        return f"{names[part.source]}:{part.use.rpartition(':')[2]}"
+    return part.use
 
 
-def _written_by_name(part: Part[Any] | None) -> Any:
+def _written_inline(part: Part[Any], info: SerializationInfo) -> dict[str, Any]:
+    use = written_use(part, info)
+    if ":" in use:
+        return {"use": use, _PARAMETERS: dict(part.parameters)}
+    return {KIND: use, **part.parameters}
+
+
+def _written_by_name(part: Part[Any] | None, info: SerializationInfo) -> Any:
     if part is None or not (":" in part.use or part.parameters):
         return part and part.use
-    return {"use": part.use, _PARAMETERS: dict(part.parameters)}
+    return {"use": written_use(part, info), _PARAMETERS: dict(part.parameters)}
+
+
+def parts_in(value: Any) -> Iterator[Part[Any]]:
+    """Yields all parts in a scenario, or in a value of one, in their order."""
+    if isinstance(value, Part):
+        yield value
+    elif isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from parts_in(getattr(value, name))
+    elif isinstance(value, (Mapping, list)):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from parts_in(item)
 
 
 def _named(group: str) -> Callable[[Any, ValidationInfo], str]:
@@ -127,7 +149,7 @@ def _named(group: str) -> Callable[[Any, ValidationInfo], str]:
         if not isinstance(value, str):
             raise PartError(context.registry.allowed(group), (), value)
         try:
-            context.registry.groups[group].find(value, context.folder)
+            context.registry.find(group, value, context.folder)
         except PartError as mistake:
             raise mistake.at(shown=value) from None
         return value

@@ -7,10 +7,10 @@ is made in `echelon.planning`; what concerns the CAN bus stands in `echelon.can_
 
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
 from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
-from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField
+from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField, written_use
 from echelon.values import (
     CouplingGain,
     Finite,
@@ -152,7 +152,7 @@ class Law(Table):
     use: LawName = Field(default="linear", validate_default=True)
     """`linear`, `integral`, `terminal_sliding` (controller.laws), or another (docs/add-a-law.md)"""
     parameters: LawParameters = Field(default_factory=dict, validate_default=True)
-    """Those of the law that `use` names"""
+    """Those of the law that `use` names; validated, they are the law itself, a Part"""
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
     epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
@@ -163,6 +163,10 @@ class Law(Table):
     """Later entries override earlier ones; none means no coupling"""
     lead: Fraction = 0.0
     """How far ahead the law looks, in periods, for laws that do: 0 is the law as it stands, 0.5 makes up for the hold"""
+
+    @field_serializer("use")
+    def _use(self, use: str, info: SerializationInfo) -> str:
+        return written_use(self.parameters, info)
 
 
 class Avoidance(Table):

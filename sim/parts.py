@@ -1,18 +1,50 @@
 """The parts that are built into this package, and scenarios loaded with them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import echelon.load
 from echelon.agents.plant import PLANTS, Plant
 from echelon.controller.laws import LAWS, Law
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
+from echelon.explain import PartError
+from echelon.load import ScenarioError
 from echelon.plan import Plan
-from echelon.plugins import Group, Registry
+from echelon.plugins import Group, Part, PartRunError, Plugin, Registry, Source
 from echelon.scenario import Scenario
+from echelon.sim.probe import probe
+from echelon.sim.time_limit import TookTooLong, time_limit
 
-REGISTRY: Final = Registry(
+LOAD_PATIENCE_S: Final = 20.0
+"""For a file that is read, or an installed part that is imported"""
+
+
+class PatientRegistry(Registry):
+    """A registry in which finding and making a part may take `LOAD_PATIENCE_S` and no longer."""
+
+    def find(self, group: str, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
+        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        with _patience(use):
+            return super().find(group, use, folder)
+
+    def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
+        """Returns a part of a group with its parameters checked.  Raises PartError."""
+        with _patience(use):
+            return super().make(group, use, parameters, folder)
+
+
+@contextmanager
+def _patience(use: str) -> Iterator[None]:
+    try:
+        with time_limit(LOAD_PATIENCE_S):
+            yield
+    except TookTooLong:
+        raise PartError(f"{use} takes longer than {LOAD_PATIENCE_S:g} s to load") from None
+
+
+REGISTRY: Final = PatientRegistry(
     {
         "laws": Group("laws", Law, LAWS),
         "plants": Group("plants", Plant, PLANTS),
@@ -23,8 +55,15 @@ REGISTRY: Final = Registry(
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
-    """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError."""
-    return echelon.load.load(path, overrides, REGISTRY)
+    """Reads a scenario file, applies overrides `key=value`, makes its plan, and tries the parts in it that others wrote.
+
+    Raises ScenarioError."""
+    scenario, plan = echelon.load.load(path, overrides, REGISTRY)
+    try:
+        probe(plan)
+    except PartRunError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+    return scenario, plan
 
 
 def parse(text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path()) -> tuple[Scenario, Plan]:

@@ -15,11 +15,12 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Final
 
+from echelon.plugins import PartRunError
 from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.contract import Body, ProcessSpec, StartError, finish, meet
 from echelon.sim.engine import make_role
-from echelon.sim.to_supervisor import Failed, Waiting
+from echelon.sim.to_supervisor import Failed, PartFailed, Waiting
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
@@ -53,6 +54,9 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         os._exit(0)
     except StartError as error:
         control.send(Failed(str(error)))
+        os._exit(1)
+    except PartRunError as error:
+        control.send(PartFailed(str(error)))
         os._exit(1)
     except BaseException:
         traceback.print_exc()

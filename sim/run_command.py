@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from echelon.plan import Plan
+from echelon.plugins import PartRunError
 from echelon.sim.usage import UsageError, scenario_of
 
 
@@ -53,6 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except ValueError as error:
         raise UsageError(str(error)) from None
+    except PartRunError as error:  # in one process, a role could not be made
+        print(f"echelon: {error}", file=sys.stderr)
+        return 3
     except OSError as error:
         print(f"echelon: {error.filename or folder}: {error.strerror or error}", file=sys.stderr)
         return 3

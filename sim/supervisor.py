@@ -20,7 +20,7 @@ from echelon.sim.children import FINISHING, Child, list_specs, start
 from echelon.sim.contract import ProcessSpec
 from echelon.sim.results.trace import Array, Trace, TraceBuilder
 from echelon.sim.to_process import End, Finish, Start, Told
-from echelon.sim.to_supervisor import Done, Failed, Ready, RecorderProgress, RecorderReport, Said, Waiting
+from echelon.sim.to_supervisor import Done, Failed, PartFailed, Ready, RecorderProgress, RecorderReport, Said, Waiting
 
 START_TIMEOUT_S: Final = 30.0
 STALL_REPORT_S: Final = 3.0
@@ -85,6 +85,7 @@ class Supervisor:
         can_urls: tuple[str, ...] = (),
         scenario_toml: str = "",
         metadata: dict[str, str] | None = None,
+        part_files: dict[str, str] | None = None,
         recorded: bool = True,
         show: Callable[[Progress], None] = lambda progress: None,
         stall_timeout_s: float = 30.0,
@@ -94,7 +95,8 @@ class Supervisor:
         self.progress = Progress()
         self._show = show
         self._stall_timeout_s = stall_timeout_s
-        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, scenario_toml, metadata or {}, recorded))
+        told = scenario_toml, metadata or {}, part_files or {}
+        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded))
         self._children: list[Child] = []
         self._moved_s = 0.0
         self._moved_at = (-1, -1)
@@ -156,9 +158,13 @@ class Supervisor:
                 self._show(self.progress)
             if deadline_s is not None and now_s > deadline_s:
                 late = [
-                    child.name for child in self._children if not (child.ready if what == "not ready" else child.done)
+                    child
+                    for child in self._children
+                    if not (child.ready if what == "not ready" else child.done or not child.is_member)
                 ]
-                raise RunError(f"{what} after {timeout_s:g} s: {', '.join(late)}{self._words_of(late)}")
+                names = [child.name for child in late]
+                who = ", ".join(child.name + child.runs() for child in late)
+                raise RunError(f"{what} after {timeout_s:g} s: {who}{self._words_of(names)}")
 
     def _serve(self, timeout_s: float) -> None:
         """Takes what children say on their control pipes and on standard error."""
@@ -200,6 +206,8 @@ class Supervisor:
                     raise RunError(f"the recording failed: {said.failure}")
             case Failed():
                 raise RunError(f"{child.spec.kind} {child.name} cannot start: {said.text}")
+            case PartFailed():
+                raise RunError(said.text)
             case Done():
                 child.done = said
 
@@ -253,7 +261,7 @@ class Supervisor:
             ]
         if silent:
             return "everyone waits for " + ", ".join(
-                f"{child.name} (process {child.process.pid}, {child.state()})" for child in silent
+                f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent
             )
         members = self.plan.all_roles
         waits = [

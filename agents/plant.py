@@ -7,6 +7,7 @@ State: reference point p = (x, y), heading θ, forward speed v, yaw rate ω; e_v
 *Paper*: v̇ = (τ_r + τ_l)/(m1 r), ω̇ = R (τ_r - τ_l)/(J r), J = I - m1 d².
 *Rigid body*, its mass at the reference point: v̇ = F/m1 + d ω², ω̇ = (τ - m1 d v ω)/(I_c + m1 d²), with F = (τ_r + τ_l)/r,
 τ = R (τ_r - τ_l)/r, I_c = I - m1 d².
+*Hill*: the rigid body with a load, on a slope, with rolling resistance; of these the controller knows nothing.
 
 A step that leaves the numbers raises ValueError or OverflowError, as the functions of `math` do; `LOST` is the state for that.
 
@@ -17,13 +18,16 @@ they are written out and not in arrays.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
-from math import ceil, cos, isfinite, nan, sin, sqrt
+from math import ceil, cos, hypot, isfinite, nan, sin, sqrt
 from typing import Final, NamedTuple
 
 from echelon.errors import PartRunError
 from echelon.plan import RobotPlan
 from echelon.plugins import Plugin
+from echelon.values import NonNegative, Point
 
+GRAVITY: Final = 9.81
+"""[m/s²]"""
 _INNER: Final = (1 - sqrt(1 / 5)) / 2
 """The Gauss-Lobatto rule with four points has its inner ones here and at 1 - here, weights 1/12, 5/12, 5/12, 1/12: exact
 up to degree 5, and two of the points are the ends, where the direction is known anyway."""
@@ -95,11 +99,22 @@ def paper_step(robot: RobotPlan) -> Step:
 
 
 def rigid_body_step(robot: RobotPlan) -> Step:
-    """Returns the rigid body's step: (v, ω) have no closed form under held torque, so the five equations are integrated
-    with the classical Runge-Kutta rule, in as many sub-steps as keep its error near rounding for the turn at hand."""
-    m, d, r, arm = robot.mass, robot.offset, robot.wheel_radius, robot.arm
-    inertia = robot.inertia  # I_c + m1 d² = I
+    """Returns the rigid body's step."""
+    return _body_step(robot, 0.0, (0.0, 0.0), 0.0)
+
+
+def _body_step(robot: RobotPlan, load: float, pull: tuple[float, float], resistance: float) -> Step:
+    """Returns the step of a rigid body that carries `load` [kg] at its reference point; `pull` [m/s²] acts there on all mass,
+    `resistance` [N s/m] on the wheels.
+
+    (v, ω) have no closed form under held torque, so the five equations are integrated with the classical Runge-Kutta rule, in
+    as many sub-steps as keep its error near rounding for the turn at hand."""
+    m, d, r, arm = robot.mass + load, robot.offset, robot.wheel_radius, robot.arm
+    inertia = robot.inertia + load * d**2  # I_c + m d²
     lever = m * d / inertia
+    pull_x, pull_y = pull
+    drag, turn_drag = resistance / m, resistance * arm**2 / inertia
+    always = drag + turn_drag + sqrt(lever * hypot(*pull))
 
     def rates(theta: float, v: float, omega: float, push: float, turn: float) -> tuple[float, ...]:
         c, s = cos(theta), sin(theta)
@@ -107,15 +122,15 @@ def rigid_body_step(robot: RobotPlan) -> Step:
             v * c - d * omega * s,
             v * s + d * omega * c,
             omega,
-            push + d * omega * omega,
-            turn - lever * v * omega,
+            push + d * omega * omega + (pull_x * c + pull_y * s) - drag * v,
+            turn - lever * (v * omega - (pull_y * c - pull_x * s)) - turn_drag * omega,
         )
 
     def step(state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
         push = (tau_right + tau_left) / (m * r)
         turn = arm * (tau_right - tau_left) / (r * inertia)
         x, y, theta, v, omega, _, _ = state
-        pace = h * (abs(omega) + lever * abs(v) + sqrt(abs(turn)) + sqrt(lever * abs(push)))
+        pace = h * (abs(omega) + lever * abs(v) + sqrt(abs(turn)) + sqrt(lever * abs(push)) + always)
         count = min(max(1, ceil(pace / 0.02)), 500) if isfinite(pace) else 1
         k = h / count
         for _ in range(count):
@@ -173,7 +188,34 @@ class RigidBody(Plant):
         return rigid_body_step(robot)
 
 
-PLANTS: Final[dict[str, type[Plugin]]] = {"paper": Paper, "rigid_body": RigidBody}
+class Hill(Plant):
+    """A rigid body that carries a load, on a slope, with rolling resistance.
+
+    With m = m1 + load, I' = I + load d², gravity along the slope g⃗ = -9.81 rise/√(1 + |rise|²), c = `resistance`, and F, τ, d,
+    R of the robot,
+
+        v̇ = (F - c v)/m + d ω² + g⃗·e_v        ω̇ = (τ - c R² ω - m d (v ω - g⃗·e_n))/I'
+
+    (Newton and Euler; the load is at the reference point, and each wheel has half of c).  x and y are along the slope."""
+
+    rise: Point = (0.0, 0.0)
+    """How steeply the ground rises along x and along y: 0.05 is five metres in a hundred"""
+    load: NonNegative = 0.0
+    """[kg]"""
+    resistance: NonNegative = 0.0
+    """c, force against rolling, over the speed [N s/m]"""
+
+    def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
+        """Returns the state after h of held torque."""
+        return self.step_of(robot)(state, tau_right, tau_left, h)
+
+    def step_of(self, robot: RobotPlan) -> Step:
+        """Returns the step of one robot."""
+        steep = -GRAVITY / hypot(1.0, *self.rise)
+        return _body_step(robot, self.load, (steep * self.rise[0], steep * self.rise[1]), self.resistance)
+
+
+PLANTS: Final[dict[str, type[Plugin]]] = {"paper": Paper, "rigid_body": RigidBody, "hill": Hill}
 """What is built in, by name."""
 
 LOST: Final = RobotState(nan, nan, nan, nan, nan, nan, nan)
@@ -183,10 +225,18 @@ _HUGE: Final = 1e12
 
 
 def make_step(robot: RobotPlan) -> Step:
-    """Returns the step of the plant that a robot's plan names; one that is not built in has its answers checked."""
+    """Returns the step of the plant that a robot's plan names; one that is not built in has its answers checked.
+
+    Raises PartRunError if the plant cannot make it."""
     plant: Plant = robot.model.made
-    step = plant.step_of(robot)
-    return step if robot.model.is_own else _checked(step, f"{robot.model.use} of {robot.name}")
+    if robot.model.is_own:
+        return plant.step_of(robot)
+    who = f"{robot.model.use} of {robot.name}"
+    try:
+        step = plant.step_of(robot)
+    except Exception as error:
+        raise PartRunError(f"{who}: step_of raised {type(error).__name__}: {error}") from error
+    return _checked(step, who)
 
 
 def _checked(step: Step, who: str) -> Step:

@@ -3,14 +3,14 @@
 Upwards it gathers what its children say and tells its parent its centroid.  Downwards it takes the acceleration of its
 centroid from its parent (the root: from the law of the centroid), adds its own shape's, and turns both into one
 acceleration per child: a = Φ_node⁻¹ (ν_shape, a_centroid).  Because Φ_M is built of the nodes, so is its inverse: the
-robots' accelerations are those of the central law (`controller.law.CentralLaw`).
+robots' accelerations are those of the central law (`controller.laws.central.CentralLaw`).
 
 Two more things travel with these (`echelon.layout`): error rates of all blocks, where blocks are coupled, and forces of
 avoidance.  A pair of robots belongs to the lowest node that has both below it: that node computes its ∇f from the positions
 its children sent up.  Above that node the pair's two forces cancel in every mean, below it they are handed down.
 
-All of the law is linear in what a node knows, but for the forces.  So its matrices are multiplied out once
-(`NodeLaw`), and a period costs one product upwards and one downwards, whatever the law.
+The linear law is linear in what a node knows, but for the forces.  So its matrices are multiplied out once (`NodeLaw`), and
+a period costs one product upwards and one downwards.  Any other law is asked block by block besides (`NodeBlocks`).
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
-from echelon.controller.law import BlockGains
+from echelon.controller.laws.in_tree import BlockGains, NodeBlocks
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import desired_shape, node_matrix
@@ -96,6 +96,7 @@ class TreeNode:
         self._coupled = plan.coupled
         self._layout = NodeLayout.of(plan, node)
         self._law = NodeLaw.of(plan, node)
+        self._blocks = NodeBlocks.of(plan, node)
         self._trajectory = make_trajectory(plan.trajectory) if node.parent is None else None
         self._pair_forces = _pair_forces(plan, node) if plan.avoidance.enabled else None
         self._no_forces = np.zeros(2 * node.robots)
@@ -152,6 +153,8 @@ class TreeNode:
         if s is None:
             return self._say_down(time_ns, NULL, NULL)
         accelerations = law.down @ np.concatenate((s, c, all_rates)) + law.constant
+        if self._blocks is not None:
+            accelerations += self._blocks(time_ns * 1e-9, s, c)
         forces = NULL
         if self._pair_forces is not None:
             near = self._pair_forces(state[layout.state.positions].reshape(-1, 2))

@@ -28,7 +28,10 @@ class UsageError(UserError):
 
 
 class PartRunError(Exception):
-    """A part that others wrote failed in a run; the text names its file and class, and what it did."""
+    """A part that others wrote failed in a run; the text is one line that names its file and class, and what it did."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 class Mistakes:

@@ -149,8 +149,10 @@ def _one_of(allowed: Sequence[str], value: Any = None) -> str:
 
 
 def _unknown(key: str, model: Any) -> str:
-    close = _close_key(key, model)
     known = ", ".join(sorted(_bare(model).model_fields))
+    if not known:
+        return "unknown key; there are none here"
+    close = _close_key(key, model)
     return f"unknown key; did you mean {close!r}?" if close else f"unknown key; known here: {known}"
 
 

@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from echelon.explain import explain, is_array, key_text, short
 from echelon.part_fields import PartContext
 from echelon.plan import Plan
 from echelon.planning import PlanError, make_plan
-from echelon.plugins import Registry
+from echelon.plugins import Registry, Source
 from echelon.scenario import Scenario
 
 
@@ -73,11 +73,13 @@ def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioE
     return ScenarioError(first, *(f"{where}: {text}" if where else text for where, text in others))
 
 
-def effective_toml(scenario: Scenario) -> str:
-    """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario."""
+def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None) -> str:
+    """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario.
+
+    `names` are other names for files of parts."""
     import tomlkit  # which takes long, and is needed by those who write alone
 
-    return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True))
+    return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True, context=names))
 
 
 def _table(text: str, name: str) -> dict[str, Any]:

@@ -5,18 +5,19 @@
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
     robot.drive.protocol = "odrive"
+    law = { use = "my_laws.py:Relay", parameters = { gain = 2.0 }, epsilon = [0.5] }   beside keys of the table itself
 
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import BaseModel, PlainSerializer, PlainValidator, SerializationInfo, ValidationInfo, WithJsonSchema
 
 from echelon.explain import PartError
-from echelon.plugins import Part, Registry
+from echelon.plugins import Part, Registry, Source
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
@@ -24,6 +25,7 @@ PART: Final = "part"
 """Stands in the JSON schema of a field of this kind, with the group of its parts: echelon.schema says what may be written"""
 BESIDE: Final = "beside"
 """Stands there too; True: parameters are written beside the part's name"""
+_NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.load)"
 
 
 class PartContext(NamedTuple):
@@ -36,7 +38,7 @@ class PartContext(NamedTuple):
 def make_part(group: str, use: Any, parameters: Any, context: PartContext | None) -> Part[Any]:
     """Returns the part that a scenario describes.  Raises PartError, whose keys are `use` or `parameters`."""
     if context is None:
-        raise TypeError("a scenario with parts is validated with a PartContext (echelon.sim.parts.load)")
+        raise TypeError(_NO_CONTEXT)
     if not isinstance(parameters, Mapping):
         raise PartError("must be a table", (_PARAMETERS,), parameters)
     if not isinstance(use, str):
@@ -102,16 +104,72 @@ def _by_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
     return validate
 
 
-def _written_inline(part: Part[Any]) -> dict[str, Any]:
-    if ":" in part.use:
-        return {"use": part.use, _PARAMETERS: dict(part.parameters)}
-    return {KIND: part.use, **part.parameters}
+def written_use(part: Part[Any], info: SerializationInfo) -> str:
+    """Returns how a scenario is to name a part: as it does, but for files that the context of pydantic, a mapping of sources,
+    gives other names to."""
+    names: Mapping[Source, str] = info.context or {}
+    if part.source is not None and part.source in names:
+        return f"{names[part.source]}:{part.use.rpartition(':')[2]}"
+    return part.use
 
 
-def _written_by_name(part: Part[Any] | None) -> Any:
+def _written_inline(part: Part[Any], info: SerializationInfo) -> dict[str, Any]:
+    use = written_use(part, info)
+    if ":" in use:
+        return {"use": use, _PARAMETERS: dict(part.parameters)}
+    return {KIND: use, **part.parameters}
+
+
+def _written_by_name(part: Part[Any] | None, info: SerializationInfo) -> Any:
     if part is None or not (":" in part.use or part.parameters):
         return part and part.use
-    return {"use": part.use, _PARAMETERS: dict(part.parameters)}
+    return {"use": written_use(part, info), _PARAMETERS: dict(part.parameters)}
+
+
+def parts_in(value: Any) -> Iterator[Part[Any]]:
+    """Yields all parts in a scenario, or in a value of one, in their order."""
+    if isinstance(value, Part):
+        yield value
+    elif isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from parts_in(getattr(value, name))
+    elif isinstance(value, (Mapping, list)):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from parts_in(item)
+
+
+def _named(group: str) -> Callable[[Any, ValidationInfo], str]:
+    """Returns the validator of a name whose parameters stand in the field `parameters` beside it."""
+
+    def validate(value: Any, info: ValidationInfo) -> str:
+        context: PartContext | None = info.context
+        if context is None:
+            raise TypeError(_NO_CONTEXT)
+        if not isinstance(value, str):
+            raise PartError(context.registry.allowed(group), (), value)
+        try:
+            context.registry.find(group, value, context.folder)
+        except PartError as mistake:
+            raise mistake.at(shown=value) from None
+        return value
+
+    return validate
+
+
+def _beside_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
+    """Returns the validator of the parameters of a part whose name stands in the field `use` before them."""
+
+    def validate(value: Any, info: ValidationInfo) -> Part[Any] | None:
+        if isinstance(value, Part):
+            return value
+        if "use" not in info.data:  # what is wrong there is said already
+            return None
+        try:
+            return make_part(group, info.data["use"], value, info.context)
+        except PartError as mistake:
+            raise _beside(mistake) from None
+
+    return validate
 
 
 TrajectoryField = Annotated[
@@ -131,4 +189,11 @@ ProtocolField = Annotated[
     PlainValidator(_by_name("protocols")),
     PlainSerializer(_written_by_name),
     WithJsonSchema({PART: "protocols", BESIDE: False}),
+]
+LawName = Annotated[str, PlainValidator(_named("laws")), WithJsonSchema({"type": "string"})]
+LawParameters = Annotated[
+    Part[Any],
+    PlainValidator(_beside_name("laws")),
+    PlainSerializer(lambda part: dict(part.parameters)),
+    WithJsonSchema({"type": "object"}),
 ]

@@ -174,10 +174,12 @@ class Plan:
     robots: tuple[RobotPlan, ...]
     nodes: tuple[NodePlan, ...]
     blocks: tuple[BlockPlan, ...]
+    law: Part[Any]
+    """A controller.laws.Law"""
     coupling: Array
     """K̄ of all blocks, (2N, 2N), zero on the diagonal blocks."""
     lead: float
-    """How far ahead the law looks, in periods of its node (controller.law)."""
+    """How far ahead the law looks, in periods of its node (controller.laws.linear)."""
     trajectory: Part[Any]
     """Of the centroid: a controller.trajectory.Trajectory"""
     avoidance: AvoidancePlan

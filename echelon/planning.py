@@ -31,7 +31,7 @@ from echelon.plan import (
     RobotPlan,
 )
 from echelon.plugins import Registry
-from echelon.scenario import LinkRule, Scenario, Uniform
+from echelon.scenario import Law, LinkRule, Scenario, Uniform
 from echelon.values import path_matches
 
 MAX_DELAY: Final = 1e6
@@ -61,6 +61,8 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
     with mistakes.noted():
         display_ns = nanoseconds(scenario.record.display_period, "record.display_period")
     with mistakes.noted():
+        _check_law(scenario.law)
+    with mistakes.noted():
         blocks = make_blocks(scenario.law, nodes)
         for at, claim in enumerate(scenario.claims):
             with mistakes.noted():
@@ -79,6 +81,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         robots=robots,
         nodes=nodes,
         blocks=blocks,
+        law=scenario.law.parameters,
         coupling=coupling,
         lead=scenario.law.lead,
         trajectory=scenario.trajectory,
@@ -98,6 +101,14 @@ def _duration_ns(scenario: Scenario, root: NodePlan) -> int:
         period = root.period_ns / 1e9
         raise PlanError(f"duration = {scenario.duration}: must be a multiple of {period}, the coordinator's period")
     return duration_ns
+
+
+def _check_law(law: Law) -> None:
+    """Refuses keys that the law makes no use of."""
+    for key, value, unset in (("gains", law.gains, []), ("lead", law.lead, 0.0)):
+        if value != unset and key not in law.parameters.made.uses:
+            what = "has gains of its own, in law.parameters" if key == "gains" else "does not look ahead"
+            raise PlanError(f"law.{key}: the law {law.use!r} {what}; leave {key} out")
 
 
 def _bus_roles(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[BusRolePlan, ...]:

@@ -137,6 +137,10 @@ class Registry:
 
     groups: Mapping[str, Group]
 
+    def find(self, group: str, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
+        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        return self.groups[group].find(use, folder)
+
     def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
         """Returns a part of a group with its parameters checked.  Raises PartError."""
         return self.groups[group].make(use, parameters, folder)
@@ -159,7 +163,7 @@ def read_source(name: str, folder: Path) -> Source:
     """Returns the text of a Python file.  Raises PartError."""
     path = folder / name
     try:
-        return Source(name, path.read_text(encoding="utf-8"))
+        return Source(name, path.read_bytes().decode())
     except OSError as error:
         raise PartError(f"{path}: {error.strerror}") from None
     except ValueError as error:  # not UTF-8, or a path with a zero byte

@@ -7,10 +7,10 @@ is made in `echelon.planning`; what concerns the CAN bus stands in `echelon.can_
 
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
 from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
-from echelon.part_fields import PlantField, TrajectoryField
+from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField, written_use
 from echelon.values import (
     CouplingGain,
     Finite,
@@ -169,17 +169,25 @@ class Coupling(Table):
 class Law(Table):
     """The control law: time scales, gains and coupling of the blocks (the groups' shapes, the formation's, the centroid)."""
 
+    use: LawName = Field(default="linear", validate_default=True)
+    """`linear`, `integral`, `terminal_sliding` (controller.laws), or another (docs/add-a-law.md)"""
+    parameters: LawParameters = Field(default_factory=dict, validate_default=True)
+    """Those of the law that `use` names; validated, they are the law itself, a Part"""
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
     epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
     """ε1, ε2, …: each block's σ is a product of the first ones; as many as the tree has layers, or with `multi` groups
     and the formation"""
     gains: list[Gains] = []
-    """Gains of blocks; later entries override earlier ones"""
+    """K_1 and K_2 of each block, for laws that use them; later entries override earlier ones"""
     coupling: list[Coupling] = []
     """Coupling of blocks; later entries override earlier ones, and without any there is none"""
     lead: Fraction = 0.0
-    """How far ahead the law looks, in periods: 0 is the paper's law as it stands, 0.5 makes up for the hold"""
+    """How far ahead the law looks, in periods, for laws that do: 0 is the law as it stands, 0.5 makes up for the hold"""
+
+    @field_serializer("use")
+    def _use(self, use: str, info: SerializationInfo) -> str:
+        return written_use(self.parameters, info)
 
 
 class Avoidance(Table):
@@ -284,7 +292,7 @@ class Scenario(Table):
     """The root of the tree"""
     trajectory: TrajectoryField
     """Where the centroid of all robots is to be: `line`, `circle`, `sine`, `waypoints`, or a trajectory of your own"""
-    law: Law = Law()
+    law: Law = Field(default_factory=dict, validate_default=True)
     """The control law"""
     avoidance: Avoidance = Avoidance()
     """Collision avoidance"""

@@ -19,6 +19,7 @@ from typing import Any, Final
 from echelon.plan import Plan, RobotPlan
 from echelon.session import loopback_endpoints
 from echelon.sim.contract import ProcessSpec
+from echelon.sim.foreign_parts import runs_text
 from echelon.sim.process import main
 from echelon.sim.to_supervisor import Done
 
@@ -27,6 +28,8 @@ ENVIRONMENT: Final = {"PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
 """For the processes of a run.  A formation's matrices are small: threads of numpy's would only wait for each other"""
 LAST_WORDS: Final = 4000
 """Bytes kept of what a process says on standard error."""
+ROLES: Final = ("robot", "leader", "coordinator")
+"""Kinds of processes that run parts which others may write"""
 FINISHING: Final = ("bridge", "drives", "referee", "recorder")
 """Processes that are told when to finish, in the order in which they are; bridge and drives keep step with the run by
 themselves where the torque path is closed and time is virtual."""
@@ -77,6 +80,10 @@ class Child:
         if code is None:
             return "does not answer"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    def runs(self) -> str:
+        """Says which parts that others wrote it runs; nothing if there are none."""
+        return runs_text(self.spec.plan, self.spec.index) if self.spec.kind in ROLES else ""
 
     def state(self) -> str:
         """Returns what the kernel says of it: running, sleeping, stopped…"""
@@ -146,6 +153,7 @@ def list_specs(
     can_urls: tuple[str, ...],
     scenario_toml: str,
     metadata: dict[str, str],
+    part_files: dict[str, str],
     recorded: bool,
 ) -> list[ProcessSpec]:
     """Lists the processes of a run and who connects to whom.
@@ -169,6 +177,7 @@ def list_specs(
         "can_urls": can_urls,
         "scenario_toml": scenario_toml,
         "metadata": metadata,
+        "part_files": part_files,
     }
 
     def with_hubs(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:

@@ -85,8 +85,9 @@ class ChunkedFile:
         ]
         start, self._indexes = MAGIC + _records(Header("ros2", LIBRARY)), list[McapRecord]()
         for name, data in attachments.items():
-            record = _records(Attachment(0, 0, name, "application/toml", data))
-            self._indexes.append(AttachmentIndex(len(start), len(record), 0, 0, len(data), name, "application/toml"))
+            media_type = "text/x-python" if name.endswith(".py") else "application/toml"
+            record = _records(Attachment(0, 0, name, media_type, data))
+            self._indexes.append(AttachmentIndex(len(start), len(record), 0, 0, len(data), name, media_type))
             start += record
         record = _records(Metadata(METADATA, metadata))
         self._indexes.append(MetadataIndex(len(start), len(record), METADATA))

@@ -11,9 +11,9 @@ from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from echelon.controller.trajectory import make_trajectory, sample
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan import Plan
+from echelon.sim.desired import Desired
 from echelon.sim.drawing import (
     CENTROID,
     GROUPS,
@@ -46,7 +46,7 @@ def trajectories(trace: Trace, width: float) -> str:
         axes = figure.subplots()
         if len(times_ns):
             place = drawable(states[:, :, [X, Y]])
-            wanted = sample(make_trajectory(plan.trajectory), np.linspace(0, times_ns[-1] / 1e9, 400))[:, 0]
+            wanted = Desired(plan).sample(np.linspace(0, times_ns[-1] / 1e9, 400))[:, 0]
             axes.plot(*wanted.T, color="#8d8d97", lw=1.6, dashes=(4, 2.5), zorder=2)
             _label(axes, wanted[-1], "desired centroid", "#70707a", (6, -2))
             centroid = place.mean(axis=1)

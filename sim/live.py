@@ -11,9 +11,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.plan import Plan
+from echelon.sim.desired import Desired
 from echelon.sim.supervisor import Progress
 
 PLAIN_S = 2.0
@@ -30,7 +30,7 @@ class Display:
         self._quiet = quiet
         self._stream = stream
         self._cbt = Transformation(plan)
-        self._trajectory = make_trajectory(plan.trajectory)
+        self._trajectory = Desired(plan)
         self._console = Console(file=stream, stderr=stream is sys.stderr)
         self._live: Live | None = None
         self._said_s = time.monotonic()

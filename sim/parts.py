@@ -1,23 +1,56 @@
 """The parts that are built into this package, and scenarios loaded with them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import echelon.loading
 from echelon.agents.plant import PLANTS, Plant
 from echelon.bridge.protocol import DriveProtocol
 from echelon.bridge.protocols import DEFAULT, PROTOCOLS
 from echelon.bridge.trial import try_protocols
+from echelon.controller.laws import LAWS, Law
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
 from echelon.errors import PartRunError
+from echelon.explain import PartError
 from echelon.loading import ScenarioError
 from echelon.plan import Plan
-from echelon.plugins import Group, Registry
+from echelon.plugins import Group, Part, Plugin, Registry, Source
 from echelon.scenario import Scenario
+from echelon.sim.probe import probe
+from echelon.sim.time_limit import TookTooLong, time_limit
 
-REGISTRY: Final = Registry(
+LOAD_PATIENCE_S: Final = 20.0
+"""For a file that is read, or an installed part that is imported"""
+
+
+class PatientRegistry(Registry):
+    """A registry in which finding and making a part may take `LOAD_PATIENCE_S` and no longer."""
+
+    def find(self, group: str, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
+        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        with _patience(use):
+            return super().find(group, use, folder)
+
+    def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
+        """Returns a part of a group with its parameters checked.  Raises PartError."""
+        with _patience(use):
+            return super().make(group, use, parameters, folder)
+
+
+@contextmanager
+def _patience(use: str) -> Iterator[None]:
+    try:
+        with time_limit(LOAD_PATIENCE_S):
+            yield
+    except TookTooLong:
+        raise PartError(f"{use} takes longer than {LOAD_PATIENCE_S:g} s to load") from None
+
+
+REGISTRY: Final = PatientRegistry(
     {
+        "laws": Group("laws", Law, LAWS),
         "plants": Group("plants", Plant, PLANTS),
         "trajectories": Group("trajectories", Trajectory, TRAJECTORIES),
         "protocols": Group("protocols", DriveProtocol, PROTOCOLS, DEFAULT),
@@ -27,32 +60,22 @@ REGISTRY: Final = Registry(
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
-    """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError."""
+    """Reads a scenario file, applies overrides `key=value`, makes its plan, and tries the parts in it that others wrote.
+
+    Raises ScenarioError."""
     return _tried(str(path), *echelon.loading.load(path, overrides, REGISTRY))
 
 
 def parse(text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path()) -> tuple[Scenario, Plan]:
     """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, `folder` holds files that the text
     names.  Raises ScenarioError."""
-
     return _tried(name, *echelon.loading.parse(text, name, overrides, REGISTRY, folder))
-
-
-def write_files(plan: Plan, folder: Path) -> None:
-    """Writes the Python files that a plan's parts come from, so that a run's folder has all that its scenario names.
-
-    Those that stand outside the scenario's folder are left out.  Raises OSError."""
-    parts = [plan.trajectory, *(part for robot in plan.robots for part in (robot.model, robot.drive.protocol))]
-    for source in {part.source.name: part.source for part in parts if part.source is not None}.values():
-        name = Path(source.name)
-        if not name.is_absolute() and ".." not in name.parts:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(source.text, encoding="utf-8")
 
 
 def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:
     """Returns what was loaded, after a trial of what others wrote."""
     try:
+        probe(plan)
         try_protocols(plan)
     except PartRunError as error:
         raise ScenarioError(f"{name}: {error}") from None

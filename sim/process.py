@@ -20,7 +20,7 @@ from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.contract import Body, ProcessSpec, StartError, finish, meet
 from echelon.sim.engine import make_role
-from echelon.sim.to_supervisor import Failed, Waiting
+from echelon.sim.to_supervisor import Failed, PartFailed, Waiting
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
@@ -52,8 +52,11 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
             body(spec, session, control)
     except SystemExit:
         os._exit(0)
-    except (StartError, PartRunError) as error:
+    except StartError as error:
         control.send(Failed(str(error)))
+        os._exit(1)
+    except PartRunError as error:
+        control.send(PartFailed(str(error)))
         os._exit(1)
     except BaseException:
         traceback.print_exc()

@@ -3,8 +3,9 @@
 Every time in the file is the run's own, so the same run gives the same bytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from echelon.bridge.frame_message import TimedFrame
@@ -25,9 +26,16 @@ FRAMES, LINKS = "/can/frames", "/links"
 class Recorder:
     """Writes a run's messages, and what shows them, as they come: in the order of time, then source."""
 
-    def __init__(self, path: Path, plan: Plan, scenario_toml: str, metadata: dict[str, str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        plan: Plan,
+        scenario_toml: str,
+        metadata: dict[str, str],
+        part_files: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         """Begins the file at `path`; raises OSError if it cannot be made.  The scenario goes into it as an attachment
-        and `metadata` (versions and the like) as metadata."""
+        and `metadata` (versions and the like) as metadata; the texts `part_files` as attachments, too, by their names."""
         self.null_messages = 0
         """How many messages said nothing; they are not written."""
         self._plan = plan
@@ -41,7 +49,8 @@ class Recorder:
         self._routes = {
             key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in routes.items()
         }
-        self._file = ChunkedFile(path, {SCENARIO: scenario_toml.encode()}, metadata, topics)
+        attachments = {name: text.encode() for name, text in {SCENARIO: scenario_toml, **part_files}.items()}
+        self._file = ChunkedFile(path, attachments, metadata, topics)
         self._file.add(self._numbers[DESIRED], 0, 0, desired(plan))
         self._now = -1
         self._head = b""

@@ -1,6 +1,7 @@
 """One run from scenario to folder: run it in one process or in many, then write what it leaves.
 
-The folder holds `scenario.toml` (effective), `run.mcap`, `can.log`, `torque.dbc`, `summary.json` and `report.html`.
+The folder holds `scenario.toml` (effective), the files of parts that others wrote, `run.mcap`, `can.log`, `torque.dbc`,
+`summary.json` and `report.html`.
 """
 
 import os
@@ -9,8 +10,10 @@ import resource
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
@@ -20,23 +23,25 @@ from echelon import __version__
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
+from echelon.errors import PartRunError
 from echelon.loading import effective_toml
 from echelon.messages import Message
 from echelon.plan import Plan
-from echelon.plugins import PartRunError
 from echelon.scenario import Scenario
 from echelon.sim.engine import Engine
+from echelon.sim.foreign_parts import stalled_in, unstalled
+from echelon.sim.kept_parts import keep_parts
 from echelon.sim.live import Display
-from echelon.sim.parts import write_files
 from echelon.sim.results.records import ProcessResult, RunFacts, Summary
 from echelon.sim.results.rendering import write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
 from echelon.sim.supervisor import Outcome, Progress, Supervisor
+from echelon.sim.time_limit import TookTooLong
 from echelon.sim.time_order import TimeOrder, speakers
 from echelon.sim.watchers import RunRecorder
 
-PARTS: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
+PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
 FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
@@ -74,18 +79,20 @@ def execute(
 
     Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
     begun = datetime.now(UTC)
-    toml = effective_toml(scenario)
+    parts = keep_parts(scenario, folder)
+    toml = effective_toml(scenario, parts.names)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
-    write_files(plan, folder)
     metadata = {
         "scenario": scenario.name,
         "engine": engine,
         "clock": clock,
         "echelon": version("echelon"),
         "python": platform.python_version(),
-    } | {part: version(part) for part in PARTS}
+    }
+    metadata |= {package: version(package) for package in PACKAGES} | parts.metadata
     if engine == "inprocess":
-        outcome = _in_process(plan, folder, clock, can_urls, toml, metadata, display)
+        recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files)
+        outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s)
     else:
         outcome = Supervisor(
             plan,
@@ -95,6 +102,7 @@ def execute(
             can_urls=can_urls,
             scenario_toml=toml,
             metadata=metadata,
+            part_files=parts.files,
             show=display.show,
             stall_timeout_s=stall_timeout_s,
         ).run()
@@ -105,7 +113,9 @@ def execute(
         except PartRunError as error:
             outcome.failure = outcome.failure or str(error)
     display.close()
-    summary = summarise(outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun))
+    summary = summarise(
+        outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun), parts.results
+    )
     write_summary(summary, folder / "summary.json")
     return summary, outcome.trace
 
@@ -122,14 +132,14 @@ def _in_process(
     folder: Path,
     clock: str,
     can_urls: tuple[str, ...],
-    toml: str,
-    metadata: dict[str, str],
+    recorder: Callable[[], RunRecorder],
     display: Display,
+    stall_timeout_s: float,
 ) -> Outcome:
     """The in-process engine with recorder and bridge beside it, in the same order of messages as between processes."""
-    recording = RunRecorder(folder, plan, toml, metadata)
     gathered: list[Message] = []
     engine = Engine(plan, gathered.append)
+    recording = recorder()
     bridge = open_bridge(plan, can_urls, folder, engine.commander)
     order = TimeOrder(speakers(plan, True, bool(can_urls)))
     progress = Progress(phase="running", started_s=time.monotonic(), bridge=bridge.progress())
@@ -141,8 +151,9 @@ def _in_process(
         recording.add(order.push(gathered))
         gathered.clear()
 
+    time_ns = 0
     try:
-        for time_ns in engine.instants():
+        for time_ns in unstalled(plan, engine.instants(), stall_timeout_s):
             if clock == "wall":
                 pass_on()
                 if (left_s := begun_s + time_ns / 1e9 - time.monotonic()) > 0:
@@ -159,23 +170,26 @@ def _in_process(
             if recording.recorder.failure:
                 failure = f"the recording failed: {recording.recorder.failure}"
                 break
-    except PartRunError as error:
-        failure = str(error)
     except KeyboardInterrupt:
         failure = "interrupted"
         bridge.interrupt()
+    except PartRunError as error:
+        failure = str(error)
+    except TookTooLong as error:
+        who = stalled_in(plan, error)
+        failure = f"stalled for {stall_timeout_s:.0f} s at t = {time_ns / 1e9:g} s: everyone waits for {who}"
     wall_s = time.monotonic() - begun_s
     try:
         pass_on()
     except (SystemExit, PartRunError):
         pass
-    recording.add(order.rest())
-    links = engine.link_counts()
-    recording.close(links)
     try:
         bridge.stop()
     except PartRunError as error:
         failure = failure or str(error)
+    recording.add(order.rest())
+    links = engine.link_counts()
+    recording.close(links)
     bridge.close()
     recorded = recording.report()
     failure = failure or (f"the recording failed: {recorded.failure}" if recorded.failure else None)

@@ -1,14 +1,15 @@
 """What a viewer is shown of a run: frames of reference, odometry, wheels, and markers of robots and groups."""
 
+from math import isfinite
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.controller.trajectory import make_trajectory
 from echelon.messages import STATE_FIELDS, Values
 from echelon.plan import NodePlan, Plan
 from echelon.sim import ros
+from echelon.sim.desired import Desired
 
 Array = NDArray[np.float64]
 
@@ -86,9 +87,8 @@ class Scene:
 
 def desired(plan: Plan) -> bytes:
     """Returns the centroid's desired trajectory as a line, of time 0: it is shown whole and does not change."""
-    trajectory = make_trajectory(plan.trajectory)
-    times = np.linspace(0.0, plan.duration_ns / 1e9, DESIRED_POINTS).tolist()
-    points = [(float(z[0]), float(z[1])) for z in (trajectory.at(t)[0] for t in times)]
+    places = Desired(plan).sample(np.linspace(0.0, plan.duration_ns / 1e9, DESIRED_POINTS))[:, 0]
+    points = [(x, y) for x, y in places.tolist() if isfinite(x) and isfinite(y)]
     layout = ros.markers(1)
     ros.add_marker(layout, "desired centroid", 0, ros.LINE_STRIP, (_size(plan) / 4, 0.0, 0.0), GREY, points)
     return ros.Template(layout).encode(0, np.empty(0))

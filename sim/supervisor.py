@@ -20,7 +20,7 @@ from echelon.sim.children import FINISHING, Child, list_specs, start
 from echelon.sim.contract import ProcessSpec
 from echelon.sim.results.trace import Array, Trace, TraceBuilder
 from echelon.sim.to_process import End, Finish, Start, Told
-from echelon.sim.to_supervisor import Done, Failed, Ready, RecorderProgress, RecorderReport, Said, Waiting
+from echelon.sim.to_supervisor import Done, Failed, PartFailed, Ready, RecorderProgress, RecorderReport, Said, Waiting
 
 NAMED: Final = 12
 """Processes that a note names; what is more is counted."""
@@ -87,6 +87,7 @@ class Supervisor:
         can_urls: tuple[str, ...] = (),
         scenario_toml: str = "",
         metadata: dict[str, str] | None = None,
+        part_files: dict[str, str] | None = None,
         recorded: bool = True,
         show: Callable[[Progress], None] = lambda progress: None,
         stall_timeout_s: float = 30.0,
@@ -96,7 +97,8 @@ class Supervisor:
         self.progress = Progress()
         self._show = show
         self._stall_timeout_s = stall_timeout_s
-        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, scenario_toml, metadata or {}, recorded))
+        told = scenario_toml, metadata or {}, part_files or {}
+        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded))
         self._children: list[Child] = []
         self._moved_s = 0.0
         self._moved_at = (-1, -1)
@@ -158,9 +160,13 @@ class Supervisor:
                 self._show(self.progress)
             if deadline_s is not None and now_s > deadline_s:
                 late = [
-                    child.name for child in self._children if not (child.ready if what == "not ready" else child.done)
+                    child
+                    for child in self._children
+                    if not (child.ready if what == "not ready" else child.done or not child.is_member)
                 ]
-                raise RunError(f"{what} after {timeout_s:g} s: {few(late)}{self._words_of(late[:NAMED])}")
+                who = few([child.name + child.runs() for child in late])
+                names = [child.name for child in late[:NAMED]]
+                raise RunError(f"{what} after {timeout_s:g} s: {who}{self._words_of(names)}")
 
     def _serve(self, timeout_s: float) -> None:
         """Takes what children say on their control pipes and on standard error."""
@@ -201,12 +207,9 @@ class Supervisor:
                 if said.failure and progress.phase == "running":
                     raise RunError(f"the recording failed: {said.failure}")
             case Failed():
-                starting = progress.phase == "starting"
-                raise RunError(
-                    f"{child.spec.kind} {child.name} cannot start: {said.text}"
-                    if starting
-                    else f"{child.name}: {said.text}"
-                )
+                raise RunError(f"{child.spec.kind} {child.name} cannot start: {said.text}")
+            case PartFailed():
+                raise RunError(said.text)
             case Done():
                 child.done = said
 
@@ -260,7 +263,7 @@ class Supervisor:
             ]
         if silent:
             return "everyone waits for " + few(
-                [f"{child.name} (process {child.process.pid}, {child.state()})" for child in silent]
+                [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent]
             )
         members = self.plan.all_roles
         waits = [

@@ -21,6 +21,13 @@ class Failed:
 
 
 @dataclass(frozen=True, slots=True)
+class PartFailed:
+    """A part that others wrote failed in it; the text names file and class."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Waiting:
     """In a lockstep, it has waited for a while for messages of these members (their indices) of this instant."""
 
@@ -66,5 +73,5 @@ class Done:
     report: Report | None = None
 
 
-Said = Ready | Failed | Waiting | BridgeProgress | RecorderProgress | Done
+Said = Ready | Failed | PartFailed | Waiting | BridgeProgress | RecorderProgress | Done
 """All that a process may say."""

@@ -5,9 +5,10 @@ slow slows the run; on a wall clock it loses, and says so.
 """
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from echelon.bridge.frame_message import unpack
@@ -89,7 +90,7 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     sources = speakers(plan, spec.virtual, bool(spec.can_urls))
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
     try:
-        recording = RunRecorder(Path(spec.folder), plan, spec.scenario_toml, spec.metadata)
+        recording = RunRecorder(Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files)
     except OSError as error:
         raise StartError(f"{error.filename}: {error.strerror}") from None
     meet(spec, session, control)
@@ -112,8 +113,15 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
 class RunRecorder:
     """Where a run's messages go once they are in order: run.mcap and the trace."""
 
-    def __init__(self, folder: Path, plan: Plan, scenario_toml: str, metadata: dict[str, str]) -> None:
-        self.recorder = Recorder(folder / "run.mcap", plan, scenario_toml, metadata)
+    def __init__(
+        self,
+        folder: Path,
+        plan: Plan,
+        scenario_toml: str,
+        metadata: dict[str, str],
+        part_files: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self.recorder = Recorder(folder / "run.mcap", plan, scenario_toml, metadata, part_files)
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self._time_ns = 0

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from synthetic import PAPER
 
-from echelon.controller.law import CentralLaw
+from echelon.controller.laws.central import CentralLaw
 from echelon.controller.sampled import spectral_radius
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Array, Plan

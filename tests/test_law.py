@@ -11,7 +11,8 @@ from scipy.optimize import root
 from synthetic import PAPER
 from trees import PAPER_TREE, plan_of, random_epsilon, random_law, scenario, trees, with_random_gains
 
-from echelon.controller.law import BlockGains, CentralLaw
+from echelon.controller.laws.central import CentralLaw
+from echelon.controller.laws.in_tree import BlockGains
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.plan import Array, AvoidancePlan, Plan
 from echelon.sim.parts import load
@@ -171,7 +172,7 @@ def test_lead_is_the_law_taken_at_the_error_to_come(seed, lead):
 
         solved = root(implicit, np.zeros(block.size), tol=1e-13).x
         gains = BlockGains.of(plan, block)
-        found = gains.nu(e[rows], e_dot[rows]) - gains.K_coupling @ e_dot
+        found = -gains.K_1 @ e[rows] - gains.K_2 @ e_dot[rows] - gains.K_coupling @ e_dot
         np.testing.assert_allclose(found, solved, rtol=1e-8, atol=1e-9)
 
 

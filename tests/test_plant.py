@@ -1,4 +1,4 @@
-"""Both plants against scipy's integrator, against the paper's equation and Newton's, and against known solutions."""
+"""All plants against scipy's integrator, against the paper's equation and Newton's, and against known solutions."""
 
 import time
 import warnings
@@ -11,16 +11,20 @@ from scipy.integrate import solve_ivp
 from synthetic import PAPER
 from trees import plan_of, scenario
 
-from echelon.agents.plant import LOST, PLANTS, RobotState, make_step, state_at
+from echelon.agents.plant import GRAVITY, LOST, PLANTS, RobotState, make_step, state_at
 from echelon.agents.robot import Robot
 from echelon.messages import Channel, Message
 from echelon.plan import Array, RobotPlan
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load
 
+HILL = {"rise": (0.05, -0.1), "load": 1.5, "resistance": 3.0}
+IN_FILE = {"hill": "{use='hill',parameters={rise=[0.05,-0.1],load=1.5,resistance=3.0}}"}
+assert set(IN_FILE) < set(PLANTS)
+
 
 def robot_of(path: str, model: str) -> RobotPlan:
-    return load(PAPER.parent / path, [f"robot.model={model}"])[1].robots[0]
+    return load(PAPER.parent / path, [f"robot.model={IN_FILE.get(model, model)}"])[1].robots[0]
 
 
 def rates(robot: RobotPlan, right: float, left: float):
@@ -39,7 +43,26 @@ def rates(robot: RobotPlan, right: float, left: float):
         i_c = inertia - m1 * d**2
         return [*p_dot, omega, push / m1 + d * omega**2, (turn - m1 * d * v * omega) / (i_c + m1 * d**2)]
 
-    return {"paper": paper, "rigid_body": rigid_body}[robot.model.use]
+    def hill(_, s):
+        """Newton for the mass and Euler about it, with the force N that keeps the axle from slipping sideways."""
+        _, _, theta, v, omega = s
+        m, i_c, c = m1 + HILL["load"], inertia - m1 * d**2, HILL["resistance"]
+        along, across = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
+        rise = np.array(HILL["rise"])
+        gravity = -GRAVITY * rise / np.sqrt(1 + rise @ rise)
+        wheels = [right / r - c / 2 * (v + arm * omega), left / r - c / 2 * (v - arm * omega)]
+        # m (v̇ - d ω²) = wheels + m g·e_v;  m (v ω + d ω̇) = N + m g·e_n;  I_c ω̇ = arm (right - left) - d N
+        v_dot, omega_dot, _ = np.linalg.solve(
+            [[m, 0, 0], [0, m * d, -1], [0, i_c, d]],
+            [
+                sum(wheels) + m * gravity @ along + m * d * omega**2,
+                m * gravity @ across - m * v * omega,
+                arm * (wheels[0] - wheels[1]),
+            ],
+        )
+        return [*(v * along + d * omega * across), omega, v_dot, omega_dot]
+
+    return {"paper": paper, "rigid_body": rigid_body, "hill": hill}[robot.model.use]
 
 
 def integrated(robot: RobotPlan, state: RobotState, right: float, left: float, h: float) -> Array:

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from runs import SCENARIOS
 
+import echelon.loading
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.trajectory import make_trajectory
 from echelon.errors import PartRunError
 from echelon.loading import ScenarioError
+from echelon.plan import Plan
 from echelon.sim.engine import Engine
-from echelon.sim.parts import load
+from echelon.sim.parts import REGISTRY, load
 
 SPIRAL = """
 from math import cos, sin
@@ -29,6 +31,7 @@ class Spiral(Trajectory):
                          [-2 * w * s - w * w * t * c, 2 * w * c - w * w * t * s]])
 """
 PLANT = """
+import echelon.loading
 from echelon.agents.plant import Plant, paper_step
 
 class Sticky(Plant):
@@ -50,6 +53,11 @@ def folder(tmp_path: Path) -> Path:
     for name in ("numpy", "math", "controller", "echelon", "pydantic"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')")
     return tmp_path
+
+
+def untried(folder: Path, *overrides: str) -> Plan:
+    """Returns a plan whose parts have not been tried (echelon.sim.probe)."""
+    return echelon.loading.load(folder / "mine.toml", overrides, REGISTRY)[1]
 
 
 def refused(folder: Path, *overrides: str) -> str:
@@ -157,7 +165,7 @@ def test_a_file_that_cannot_be_used_is_one_line(folder: Path, text: str, says: s
 )
 def test_a_trajectory_that_fails_in_a_run_is_named(folder: Path, line: str, says: str) -> None:
     (folder / "my_paths.py").write_text(SPIRAL.replace("w, c, s = ", f"{line}; w, c, s = "))
-    trajectory = make_trajectory(load(folder / "mine.toml", [USE_SPIRAL])[1].trajectory)
+    trajectory = make_trajectory(untried(folder, USE_SPIRAL).trajectory)
     with pytest.raises(PartRunError) as caught:
         trajectory.at(1.0)
     assert str(caught.value).startswith(says)
@@ -173,7 +181,7 @@ def test_a_trajectory_that_fails_in_a_run_is_named(folder: Path, line: str, says
 )
 def test_a_plant_that_fails_in_a_run_is_named(folder: Path, line: str, says: str) -> None:
     (folder / "my_plants.py").write_text(PLANT.replace("return paper_step", f"{line}; return paper_step"))
-    step = make_step(load(folder / "mine.toml", [USE_PLANT])[1].robots[0])
+    step = make_step(untried(folder, USE_PLANT).robots[0])
     with pytest.raises(PartRunError) as caught:
         step(state_at(0, 0, 0, 0, 0), 0.0, 0.0, 0.1)
     assert str(caught.value).startswith(f"my_plants.py:Sticky of g1/r1: {says}")

@@ -12,7 +12,8 @@ from scipy.signal import cont2discrete
 from synthetic import PAPER
 from trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_random_gains
 
-from echelon.controller.law import BlockGains, CentralLaw
+from echelon.controller.laws.central import CentralLaw
+from echelon.controller.laws.in_tree import BlockGains
 from echelon.controller.sampled import delay_margin, error_map, largest_stable_delay, spectral_radius, tick_gains
 from echelon.controller.trajectory import Line
 from echelon.plan import Array, Plan

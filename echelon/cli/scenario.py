@@ -158,14 +158,13 @@ def analyse(options: AnalyseOptions) -> int:
 
 def _margins(plan: "Plan") -> dict[str, dict[str, float]]:
     """Returns each block's time scale [s] and how much delay it bears alone, in continuous time [s]."""
-    from echelon.controller.law import BlockGains
-    from echelon.controller.sampled import delay_margin
+    from echelon.controller.sampled import delay_margin, linear_gains
 
     margins = {}
     for block in plan.blocks:
         if block.size:
-            gains = BlockGains.of(plan, block, 0.0)
-            margin = delay_margin(float(gains.K_1[0, 0]), float(gains.K_2[0, 0]))
+            gains = linear_gains(plan, block, 0.0)
+            margin = delay_margin(*(float(matrix[0, 0]) for matrix in (gains.K_1, gains.K_2, gains.K_i)))
             margins[block.name] = {"sigma": block.sigma, "delay_margin": margin}
     return margins
 

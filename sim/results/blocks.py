@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan import BlockPlan
+from echelon.sim.desired import Desired
 from echelon.sim.results.trace import Trace
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def block_series(trace: Trace) -> Blocks:
     plan = trace.plan
     transformation = Transformation(plan)
     instants, size = len(times_ns), 2 * len(plan.robots)
-    reference = sample(make_trajectory(plan.trajectory), times_ns / 1e9)
+    reference = Desired(plan).sample(times_ns / 1e9)
     desired = np.empty((instants, size))
     desired[:, :-2] = transformation.desired_shape.reshape(-1)
     desired[:, -2:] = reference[:, 0]

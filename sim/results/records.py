@@ -140,6 +140,18 @@ class LinkResult:
 
 
 @dataclass(frozen=True, slots=True)
+class PartResult:
+    """A law, plant or trajectory that is not built in."""
+
+    use: str
+    """As scenario.toml beside summary.json names it"""
+    file: str | None
+    """Its Python file there; None if it is installed"""
+    sha256: str | None
+    """Of the file, hexadecimal"""
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessResult:
     """What a process of the run took."""
 
@@ -214,3 +226,5 @@ class Summary:
     """None where the run had no bus"""
     run: RunFacts
     trace_digest: str
+    parts: tuple[PartResult, ...] = ()
+    """That are not built in"""

@@ -18,11 +18,17 @@ from echelon.sim.results.measures import (
     separation_results,
     torque_result,
 )
-from echelon.sim.results.records import FORMAT, ClaimResult, RunFacts, Summary, Verdict
+from echelon.sim.results.records import FORMAT, ClaimResult, PartResult, RunFacts, Summary, Verdict
 from echelon.sim.results.trace import Trace
 
 
-def summarise(trace: Trace, links: Sequence[LinkCounts], can: CanReport | None, run: RunFacts) -> Summary:
+def summarise(
+    trace: Trace,
+    links: Sequence[LinkCounts],
+    can: CanReport | None,
+    run: RunFacts,
+    parts: tuple[PartResult, ...] = (),
+) -> Summary:
     """Returns what a run showed.  Nothing is raised for one that diverged, broke off or never began: its verdict says so."""
     plan = trace.plan
     blocks = block_series(trace)
@@ -50,6 +56,7 @@ def summarise(trace: Trace, links: Sequence[LinkCounts], can: CanReport | None, 
         can=can,
         run=run,
         trace_digest=trace.digest(),
+        parts=parts,
     )
 
 

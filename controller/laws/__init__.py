@@ -1,0 +1,18 @@
+"""Control laws: what one is (`law`), and those that are built in."""
+
+from typing import Final
+
+from echelon.controller.laws.integral import Integral
+from echelon.controller.laws.law import Block, Law, LinearGains
+from echelon.controller.laws.linear import Linear
+from echelon.controller.laws.terminal_sliding import TerminalSliding
+from echelon.plugins import Plugin
+
+LAWS: Final[dict[str, type[Plugin]]] = {
+    "linear": Linear,
+    "integral": Integral,
+    "terminal_sliding": TerminalSliding,
+}
+"""What is built in, by name."""
+
+__all__ = ["LAWS", "Block", "Integral", "Law", "Linear", "LinearGains", "TerminalSliding"]

@@ -1,0 +1,87 @@
+"""A law in the tree: what of it is matrices, and what a node must ask block by block.
+
+Of the linear law all is matrices; a node multiplies them out once (`controller.node.NodeLaw`).  Of any other law coupling and
+avoidance still are.  The rest, η = ν - Z̈_bd of the node's own blocks, is asked for in each period and turned into a part of its
+children's accelerations, Φ_node⁻¹ η.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from echelon.controller.laws.law import law_block, make_nu, make_state, make_weight
+from echelon.controller.laws.linear import Linear
+from echelon.controller.transformation import desired_shape, node_matrix
+from echelon.plan import Array, BlockPlan, NodePlan, Plan
+
+
+@dataclass(frozen=True, slots=True)
+class BlockGains:
+    """The matrices of one block, as they act: K_1 [1/s²] and K_2 [1/s], zero unless the law is the linear one; the row
+    W K̄_b of the coupling [1/s]; W k_b [1/s]."""
+
+    K_1: Array
+    K_2: Array
+    K_coupling: Array
+    K_pot: Array
+
+    @classmethod
+    def of(cls, plan: Plan, block: BlockPlan, lead: float | None = None) -> "BlockGains":
+        """Returns the matrices of a block of a plan; with `lead` [periods] instead of the plan's, if given."""
+        rows = slice(block.offset, block.offset + block.size)
+        seen = law_block(plan, block, lead)
+        if is_linear(plan):
+            gains = plan.law.made.linear(seen)
+            K_1, K_2, weight = gains.K_1, gains.K_2, gains.weight
+        else:
+            K_1 = K_2 = np.zeros((block.size, block.size))
+            weight = make_weight(plan.law, seen)
+        return cls(K_1, K_2, weight @ plan.coupling[rows], weight / block.sigma)
+
+
+def is_linear(plan: Plan) -> bool:
+    """True if the plan's law is the linear one itself, which has no state and is all matrices."""
+    return type(plan.law.made) is Linear
+
+
+class NodeBlocks:
+    """The blocks of one node, under a law that is not all matrices."""
+
+    def __init__(self, plan: Plan, node: NodePlan) -> None:
+        count = len(node.children)
+        phi = node_matrix(node.weights)
+        self._back = np.kron(np.linalg.inv(phi), np.eye(2))
+        self._errors_of_s = np.kron(phi, np.eye(4))
+        self._desired = np.zeros((count, 4))
+        self._desired[:-1, :2] = desired_shape(node.shape, node.weights)
+        self._is_root = node.parent is None
+        shape, centroid = plan.block_of(node.index), plan.blocks[-1]
+        own = [(shape, slice(0, count - 1))] if count > 1 else []
+        if self._is_root:
+            own.append((centroid, slice(count - 1, count)))
+        self._own = []
+        for block, variables in own:
+            seen = law_block(plan, block)
+            self._own.append((variables, make_nu(plan.law, seen), make_state(plan.law, seen)))
+
+    @classmethod
+    def of(cls, plan: Plan, node: NodePlan) -> "NodeBlocks | None":
+        """Returns the blocks of a node; None if the plan's law is all matrices."""
+        return None if is_linear(plan) else cls(plan, node)
+
+    def __call__(self, t: float, s: Array, c: Array) -> Array:
+        """Returns Φ_node⁻¹ η, what the law adds to the children's accelerations at t [s], (2 n,) [m/s²].
+
+        s are positions and velocities of the n children, (4 n,); c is (z_cd, ż_cd, z̈_cd), (6,), where the node is the root."""
+        errors = (self._errors_of_s @ s).reshape(-1, 4) - self._desired
+        feed_forward = np.zeros((len(errors), 2))
+        if self._is_root:
+            errors[-1] -= c[:4]
+            feed_forward[-1] = c[4:]
+        eta = np.zeros_like(feed_forward)
+        for variables, nu, state in self._own:
+            e, e_dot = errors[variables, :2].ravel(), errors[variables, 2:].ravel()
+            given = feed_forward[variables].ravel()
+            e.flags.writeable = e_dot.flags.writeable = given.flags.writeable = False
+            eta[variables] = (nu(t, e, e_dot, given, state) - given).reshape(-1, 2)
+        return np.asarray(self._back @ eta.ravel())

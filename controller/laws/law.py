@@ -1,0 +1,177 @@
+"""What a control law is: for one block of the transformed state, from the error to ν, the wanted Z̈_b [m/s²].
+
+Around it the tree stays as it is (docs/architecture.md, 2.3): it adds coupling and avoidance to ν, and turns the ν of all
+blocks into accelerations of robots.  With the error e = Z_b - Z_bd the acceleration of block b is
+
+    Z̈_b = ν_b(t, e_b, ė_b, Z̈_bd) + W_b (-Σ_{b'≠b} K̄_bb' ė_b' + F_pot,b/σ_b)
+
+where W_b is the unit matrix unless the law says otherwise.  To add a law, derive a class from `Law` (docs/add-a-law.md).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from echelon.errors import PartRunError
+from echelon.plan import Array, BlockPlan, Plan
+from echelon.plugins import Part, Plugin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A block as a law sees it."""
+
+    name: str
+    """`g1` of a group's shape, `inter`, `centroid`"""
+    layer: str
+    """`intra`, `middle`, `inter` or `centroid`"""
+    size: int
+    """How many numbers e has: x and y of each variable"""
+    sigma: float
+    """σ, the block's time scale [s]"""
+    period_s: float
+    """T, for which ν is held [s]"""
+    lead: float
+    """λ of `law.lead`, how far to look ahead, in periods"""
+    K_1: Array
+    """K_f1/σ² [1/s²] of `law.gains`, (size, size)"""
+    K_2: Array
+    """K_f2/σ [1/s] of `law.gains`, (size, size)"""
+
+    @property
+    def ahead_s(self) -> float:
+        """λ T, how far to look ahead [s]."""
+        return self.lead * self.period_s
+
+
+@dataclass(frozen=True, slots=True)
+class LinearGains:
+    """A law that is linear, with look-ahead multiplied out:
+
+        ν = Z̈_bd - K_1 e - K_2 ė - K_i q        q ← q + T e + T²/2 ė    after each period
+
+    and W = `weight`; matrices (size, size)."""
+
+    K_1: Array
+    K_2: Array
+    K_i: Array
+    weight: Array
+
+
+Nu = Callable[[float, Array, Array, Array, Array], Array]
+"""(t [s], e [m], ė [m/s], Z̈_bd [m/s²], own state) → ν [m/s²]"""
+
+
+class Law(Plugin, ABC):
+    """Base of all control laws; the fields of a class are its parameters."""
+
+    uses: ClassVar[frozenset[str]] = frozenset()
+    """Which of the keys `gains` and `lead` of `[law]` it makes use of; a scenario that sets another one is refused"""
+
+    @abstractmethod
+    def nu(self, block: Block, t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
+        """Returns ν [m/s²], (size,), for the error e [m] and its rate ė [m/s] at t [s].
+
+        `feed_forward` is Z̈_bd [m/s²], zero for shapes.  `state` is the block's own: `state_size` numbers, zero at the start.
+        The law may write into it.  It is called once in each period T of the block's node, but not in one in which the node
+        misses a message and commands nothing.  The other arrays are read-only."""
+
+    def nu_of(self, block: Block) -> Nu:
+        """Returns `nu` of one block; to be overridden where something can be computed once per block."""
+        return partial(self.nu, block)
+
+    def state_size(self, block: Block) -> int:
+        """Returns how many numbers the law keeps for a block."""
+        return 0
+
+    def weight(self, block: Block) -> Array:
+        """Returns W, (size, size): how coupling and avoidance enter Z̈_b beside ν."""
+        return np.eye(block.size)
+
+    def linear(self, block: Block) -> LinearGains | None:
+        """Returns the law's gains if it is linear, for analysis; None if it is not."""
+        return None
+
+
+def law_block(plan: Plan, block: BlockPlan, lead: float | None = None) -> Block:
+    """Returns a block of a plan as a law sees it; with `lead` [periods] instead of the plan's, if given."""
+    node = plan.root if block.node is None else plan.formation[block.node]
+    K_1, K_2 = block.k1 / block.sigma**2, block.k2 / block.sigma
+    K_1.flags.writeable = K_2.flags.writeable = False
+    lead = plan.lead if lead is None else lead
+    return Block(block.name, block.layer, block.size, block.sigma, node.period_ns * 1e-9, lead, K_1, K_2)
+
+
+_HUGE: Final = 1e12
+"""Where a law that others wrote may fail because the run's numbers ran away"""
+
+
+def make_nu(part: Part[Any], block: Block) -> Nu:
+    """Returns ν of a plan's law for a block; that of a law that is not built in has its answers checked.
+
+    Raises PartRunError if the law cannot make it."""
+    law: Law = part.made
+    if part.is_own:
+        return law.nu_of(block)
+    who = f"{part.use} of block {block.name}"
+    try:
+        nu = law.nu_of(block)
+    except Exception as error:
+        raise PartRunError(f"{who}: nu_of raised {type(error).__name__}: {error}") from error
+    return _checked(nu, block.size, who)
+
+
+def make_state(part: Part[Any], block: Block) -> Array:
+    """Returns the state that a plan's law starts with, zeros.  Raises PartRunError if the law gives no size."""
+    law: Law = part.made
+    who = f"{part.use} of block {block.name}"
+    try:
+        size = law.state_size(block)
+    except Exception as error:
+        raise PartRunError(f"{who}: state_size raised {type(error).__name__}: {error}") from error
+    if not isinstance(size, int) or size < 0:
+        raise PartRunError(f"{who}: state_size must be a whole number that is not negative, not {size!r:.60}")
+    return np.zeros(size)
+
+
+def make_weight(part: Part[Any], block: Block) -> Array:
+    """Returns W of a plan's law for a block.  Raises PartRunError if the law gives none."""
+    law: Law = part.made
+    who, shape = f"{part.use} of block {block.name}", (block.size, block.size)
+    try:
+        weight = np.asarray(law.weight(block), dtype=np.float64)
+    except Exception as error:
+        raise PartRunError(f"{who}: weight raised {type(error).__name__}: {error}") from error
+    if weight.shape != shape:
+        raise PartRunError(f"{who}: weight has the shape {weight.shape}, not {shape}")
+    if not np.isfinite(weight).all():
+        raise PartRunError(f"{who}: weight is not finite: {weight.tolist()!s:.120}")
+    return weight
+
+
+def _checked(nu: Nu, size: int, who: str) -> Nu:
+    """Returns ν that raises PartRunError if, for numbers that a run can have, it raises or returns anything but `size` finite
+    numbers.  For numbers that ran away it may fail: then the answer is not a number."""
+
+    def checked(t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
+        lost = not all(np.abs(given).max() < _HUGE for given in (e, e_dot, feed_forward))
+        try:
+            given = nu(t, e, e_dot, feed_forward, state)
+            answer = np.asarray(given, dtype=np.float64)
+        except Exception as error:
+            if lost:
+                return np.full(size, np.nan)
+            raise PartRunError(f"{who}: nu at t = {t:g} s raised {type(error).__name__}: {error}") from error
+        if given is None:
+            raise PartRunError(f"{who}: nu at t = {t:g} s returned nothing; it must return {size} numbers")
+        if answer.shape != (size,):
+            raise PartRunError(f"{who}: nu at t = {t:g} s has the shape {answer.shape}, not ({size},)")
+        if not lost and not np.isfinite(answer).all():
+            raise PartRunError(f"{who}: nu at t = {t:g} s is not finite: {answer.tolist()!s:.120}")
+        return answer
+
+    return checked

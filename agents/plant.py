@@ -20,8 +20,9 @@ from functools import partial
 from math import ceil, cos, isfinite, nan, sin, sqrt
 from typing import Final, NamedTuple
 
+from echelon.errors import PartRunError
 from echelon.plan import RobotPlan
-from echelon.plugins import PartRunError, Plugin
+from echelon.plugins import Plugin
 
 _INNER: Final = (1 - sqrt(1 / 5)) / 2
 """The Gauss-Lobatto rule with four points has its inner ones here and at 1 - here, weights 1/12, 5/12, 5/12, 1/12: exact

@@ -25,7 +25,7 @@ from echelon.bridge.bus_url import resolve_url
 from echelon.bridge.commander import RobotChannel
 from echelon.bridge.frame import Frame
 from echelon.bridge.protocols import drive_places, make_drive
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan import Plan
 from echelon.shipped import shipped

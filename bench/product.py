@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from echelon.bridge.bus_url import resolve_url
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.shipped import shipped
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display
@@ -59,7 +59,7 @@ def lab_in_process(*, whole: bool) -> float:
     if whole:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             display = Display(plan, quiet=True)
-            done = execute(
+            summary, _ = execute(
                 scenario,
                 plan,
                 Path(folder),
@@ -68,7 +68,7 @@ def lab_in_process(*, whole: bool) -> float:
                 can_urls=("virtual",),
                 display=display,
             )
-        return float(done.summary.run.real_time_factor or 0.0)
+        return float(summary.run.real_time_factor or 0.0)
     engine = Engine(plan)
     begun_s = time.perf_counter()
     engine.run()

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from echelon.part_fields import ProtocolField
 from echelon.values import (
     Bitrate,
     Constant,
@@ -25,11 +26,11 @@ from echelon.values import (
 class DriveTable(Table):
     """The drives of a robot's wheels, and their motors; both wheels have the same."""
 
-    protocol: Literal["native", "odrive", "cia402"] | None = None
-    """`native` (one frame for both wheels, counter and CRC; the default), `odrive` (CANSimple 0.6) or `cia402` (cyclic
-    synchronous torque over CANopen)"""
+    protocol: ProtocolField = None
+    """`native` (one frame for both wheels, counter and CRC; the default), `odrive` (CANSimple 0.6), `cia402` (cyclic
+    synchronous torque over CANopen), or your own"""
     node_ids: tuple[NodeId, NodeId] | None = None
-    """Of the right and the left wheel's drive; by default two numbers of the robot's own"""
+    """Of the right and the left wheel's drive; unless given, the lowest whose identifiers nobody on the bus uses"""
     recover_after: Seconds | None = None
     """How long after a fault the bridge clears it and enables the drive anew [s]; never unless given"""
     torque_limit: Constant | None = None
@@ -104,7 +105,7 @@ class Can(Table):
     buses: dict[Name, Bus] = {}
     """Several buses by name, each with a `url` and a `bitrate` of its own if need be; robots say theirs with `bus`"""
     torque_scale: Positive = 0.001
-    """Newton metres per bit of the native torque frame; ±32767 bits fit"""
+    """Newton metres per bit where a frame has torques as whole numbers; ±32767 bits fit"""
     path: Literal["mirror", "closed"] = "mirror"
     """`mirror`: the plant takes the computed torque, the bus shows it.  `closed`: the plant takes what the drives report,
     which is what they decoded from the frames"""
@@ -148,8 +149,8 @@ class DriveFault(Table):
 
 
 class Estop(Table):
-    """Emergency stop, each protocol's own (the native flag, ODrive's Estop, CiA 402's quick stop): drives take the torque away
-    by themselves and stay disabled, for good unless it has a `duration`."""
+    """Emergency stop, each protocol's own: drives take the torque away by themselves and stay disabled, for good unless it has
+    a `duration`."""
 
     kind: Literal["estop"]
     """Somebody presses the button"""

@@ -27,6 +27,10 @@ class UsageError(UserError):
     """Arguments of a command that do not go together, or that ask for what this machine does not have."""
 
 
+class PartRunError(Exception):
+    """A part that others wrote failed in a run; the text names its file and class, and what it did."""
+
+
 class Mistakes:
     """Collects the mistakes of steps that do not need one another."""
 

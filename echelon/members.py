@@ -8,6 +8,7 @@ from typing import Any, Final, TypeVar
 
 from echelon import shapes
 from echelon.can_plan import CanPlan
+from echelon.can_tables import DriveTable
 from echelon.drives import DriveMaker, make_can
 from echelon.errors import Mistakes
 from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
@@ -25,7 +26,7 @@ DEFAULT_PLANT: Final = "paper"
 NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
 """What must be said of every robot, on some level."""
 MAX_ROBOTS: Final = 127
-"""As many as the native torque frame has identifiers for."""
+"""As many as a bus has identifiers for where each robot has three of its own."""
 MAX_NS: Final = 2**62
 """146 years: sums of two instants still fit the message header."""
 
@@ -49,13 +50,13 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
         acceleration_ns=nanoseconds(scenario.periods.acceleration, "periods.acceleration"),
         torque_ns=torque_ns,
         first_node=count,
-        drives=DriveMaker(scenario.can, can),
+        drives=DriveMaker(scenario.can, can, registry.default("protocols")),
         closed=can.closed,
         default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
     walk.check()
-    return tuple(walk.robots), tuple(walk.nodes), can
+    return walk.drives.placed(walk.robots), tuple(walk.nodes), can
 
 
 def robot_key(path: str) -> str:
@@ -98,7 +99,7 @@ class _Walk:
         default_plant: Part[Any],
     ) -> None:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
-        self._drives, self._closed, self._default_plant = drives, closed, default_plant
+        self.drives, self._closed, self._default_plant = drives, closed, default_plant
         self._mistakes = Mistakes()
         self._of_robots: dict[str, list[str]] = {}  # what is wrong, behind the robot's key: the keys of those robots
         self.robots: list[RobotPlan] = []
@@ -167,7 +168,7 @@ class _Walk:
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model"})
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
         if lacking := [needed for needed in NEEDED if needed not in values]:
             nowhere = "missing (neither here, nor in its group, nor in [robot])"
             raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
@@ -183,8 +184,8 @@ class _Walk:
         cycle_ns = self._torque_ns if self._closed else period_ns
         return RobotPlan(
             index=index,
-            envelope=self._drives.envelope(values),
-            drive=self._drives.drive(values, place.key, index, place.path, cycle_ns),
+            envelope=self.drives.envelope(values),
+            drive=self.drives.drive(table.drive or DriveTable(), values, place.key, index, place.path, cycle_ns),
             path=place.path,
             parent=place.parent,
             child_number=place.child_number,

@@ -4,6 +4,7 @@
     trajectory = { use = "my_paths.py:Spiral", parameters = { rate = 0.2 } }         the same for any part
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
+    robot.drive.protocol = "odrive"
 
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
@@ -124,4 +125,10 @@ PlantField = Annotated[
     PlainValidator(_by_name("plants")),
     PlainSerializer(_written_by_name),
     WithJsonSchema({PART: "plants", BESIDE: False}),
+]
+ProtocolField = Annotated[
+    Part[Any] | None,
+    PlainValidator(_by_name("protocols")),
+    PlainSerializer(_written_by_name),
+    WithJsonSchema({PART: "protocols", BESIDE: False}),
 ]

@@ -37,10 +37,6 @@ class Plugin(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class PartRunError(Exception):
-    """A part that others wrote failed in a run; the text names its file and class, and what it did."""
-
-
 @dataclass(frozen=True, slots=True)
 class Source:
     """The Python file that a part comes from."""
@@ -90,6 +86,8 @@ class Group:
     name: str
     base: type[Plugin]
     built_in: Mapping[str, type[Plugin]]
+    default: str = ""
+    """Which of those a scenario has that names none; empty: it must name one"""
 
     def find(self, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
         """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
@@ -142,6 +140,10 @@ class Registry:
     def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
         """Returns a part of a group with its parameters checked.  Raises PartError."""
         return self.groups[group].make(use, parameters, folder)
+
+    def default(self, group: str) -> Part[Any]:
+        """Returns the part of a group that a scenario has which names none."""
+        return self.make(group, self.groups[group].default, {}, Path())
 
     def allowed(self, group: str) -> str:
         """Returns what a scenario may write for a part of a group."""

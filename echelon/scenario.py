@@ -1,7 +1,7 @@
 """The scenario: what a user writes, as pydantic models.  Every key is known, every value has a range and SI units.
 
 A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
-then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.load`; the plan that roles work with
+then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.loading`; the plan that roles work with
 is made in `echelon.planning`; what concerns the CAN bus stands in `echelon.can_tables`.
 """
 

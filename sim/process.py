@@ -15,6 +15,7 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Final
 
+from echelon.errors import PartRunError
 from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.contract import Body, ProcessSpec, StartError, finish, meet
@@ -51,7 +52,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
             body(spec, session, control)
     except SystemExit:
         os._exit(0)
-    except StartError as error:
+    except (StartError, PartRunError) as error:
         control.send(Failed(str(error)))
         os._exit(1)
     except BaseException:

@@ -201,7 +201,12 @@ class Supervisor:
                 if said.failure and progress.phase == "running":
                     raise RunError(f"the recording failed: {said.failure}")
             case Failed():
-                raise RunError(f"{child.spec.kind} {child.name} cannot start: {said.text}")
+                starting = progress.phase == "starting"
+                raise RunError(
+                    f"{child.spec.kind} {child.name} cannot start: {said.text}"
+                    if starting
+                    else f"{child.name}: {said.text}"
+                )
             case Done():
                 child.done = said
 

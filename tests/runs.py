@@ -15,6 +15,7 @@ from echelon.sim.results.trace import Trace, TraceBuilder
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIOS = ROOT / "deploy" / "scenarios"
+EXAMPLES = ROOT / "examples"
 
 
 def plan_of(name: str, *overrides: str) -> Plan:

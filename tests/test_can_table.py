@@ -13,8 +13,9 @@ from runs import echelon, plan_of, start_echelon, until
 from echelon.bridge.bus import open_bus
 from echelon.bridge.bus_load import worst_case_bits
 from echelon.bridge.canlog import read_log
+from echelon.bridge.cyclic import WheelState
 from echelon.bridge.frame import Frame
-from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, encode_status
 from echelon.bridge.referee import Referee
 from echelon.cli import main
 from echelon.cli.listening import show_live

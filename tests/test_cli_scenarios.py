@@ -138,7 +138,7 @@ def test_a_new_scenario_is_tame_and_holds(groups: str, drive: str | None) -> Non
     scenario, plan = parse(text, "t.toml")
     assert scenario.name == "new-one"
     assert tuple(len(group.robots) for group in scenario.formation.groups.values()) == sizes(groups)
-    assert (plan.can.path, {robot.drive.protocol for robot in plan.robots}) == (
+    assert (plan.can.path, {robot.drive.protocol.use for robot in plan.robots}) == (
         "closed" if drive else "mirror",
         {drive or "native"},
     )

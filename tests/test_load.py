@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from echelon.errors import one_line
 from echelon.explain import TEXTS, key_text, value_text
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.sim.parts import load, parse
 
 SCENARIOS = sorted((Path(__file__).resolve().parent.parent / "deploy" / "scenarios").glob("*.toml"))
@@ -476,10 +476,10 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def is_number(value: Any, path: tuple[Any, ...]) -> bool:
-    """True if a number stands at a path."""
+    """True if a number stands at a path, one that can be multiplied."""
     for key in path:
         value = value[key]
-    return isinstance(value, float | int) and not isinstance(value, bool)
+    return isinstance(value, float | int) and not isinstance(value, bool) and abs(value) < 10**300
 
 
 @st.composite

@@ -7,7 +7,7 @@ import cantools
 import pytest
 from runs import echelon, plan_of, summary_of
 
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.sim.parts import load, parse
 from echelon.sim.recorder import frame_topics
 from echelon.sim.recording import _records, read_trace

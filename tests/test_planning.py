@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_shapes import variables
 
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.members import MAX_ROBOTS, nanoseconds
 from echelon.messages import Channel
 from echelon.plan import Plan, PlanError

@@ -10,8 +10,8 @@ from runs import SCENARIOS
 
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.trajectory import make_trajectory
-from echelon.load import ScenarioError
-from echelon.plugins import PartRunError
+from echelon.errors import PartRunError
+from echelon.loading import ScenarioError
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 import echelon.scenario
 from echelon.controller.trajectory import Waypoints
-from echelon.load import ScenarioError, effective_toml
+from echelon.loading import ScenarioError, effective_toml
 from echelon.part_fields import PartContext
 from echelon.plan import Plan
 from echelon.scenario import RobotTable, Scenario, Shape

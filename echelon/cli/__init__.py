@@ -8,7 +8,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from echelon.errors import UserError, one_line
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy reads it when it is loaded: its threads would only wait
+
+from echelon.errors import PartRunError, UserError, one_line
 
 DEBUG = "ECHELON_DEBUG"
 """Set to 1 in the environment, it is as if `--debug` were given."""
@@ -30,6 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"echelon: {error}", file=sys.stderr)
         return 2
+    except PartRunError as error:
+        print(f"echelon: {one_line(str(error))}", file=sys.stderr)
+        return 3
     except BrokenPipeError:  # a reader such as head that has seen enough
         _drop_output()
         return 0

@@ -87,7 +87,8 @@ def referee(options: RefereeOptions) -> int:
 
 def _plan_of(options: ListenOptions) -> "tuple[Plan, Path | None]":
     """Returns the plan of a scenario or of a run's folder, and that folder.  Raises UserError."""
-    from echelon.cli.scenario_file import read_scenario, run_folder
+    from echelon.cli.scenario_file import read_scenario
+    from echelon.shipped import run_folder
 
     folder = run_folder(options.scenario)
     if folder is not None and options.overrides:
@@ -117,9 +118,9 @@ class DrivesOptions(ScenarioOptions):
 
 def drives(options: DrivesOptions) -> int:
     """Serves a scenario's buses with its virtual drives, in real time."""
-    from echelon.cli.bus_urls import bus_urls, check_wall_clock
     from echelon.cli.drive_bench import serve
     from echelon.cli.scenario_file import read_scenario
+    from echelon.sim.bus_urls import bus_urls, check_wall_clock
 
     _, plan = read_scenario(options.scenario, [*options.overrides, "can.path=closed", "can.virtual_drives=true"])
     urls = bus_urls(plan, options.can, False)

@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command
+from echelon.bridge.protocols import protocol_of
 from echelon.bridge.stations.waiting import RunClock
 from echelon.bridge.stations.wall_drives import WallDrives
-from echelon.drives import identifiers
 from echelon.errors import UsageError
-from echelon.plan import Plan, RobotPlan
+from echelon.plan import Plan
 
 LINE_S: Final = 1.0
 """Between two lines."""
@@ -67,9 +67,9 @@ def bench_facts(plan: Plan, urls: Sequence[str]) -> Facts:
         "robots": [
             {
                 "name": robot.name,
-                "protocol": robot.drive.protocol,
+                "protocol": robot.drive.protocol.use,
                 "bus": plan.can.buses[robot.drive.bus].name,
-                **_place(robot),
+                "place": protocol_of(robot).place(robot.drive),
             }
             for robot in plan.robots
         ],
@@ -78,24 +78,12 @@ def bench_facts(plan: Plan, urls: Sequence[str]) -> Facts:
     }
 
 
-def _place(robot: RobotPlan) -> Facts:
-    """Returns how a host addresses the drives of a robot."""
-    if robot.drive.protocol != "native":
-        return {"nodes": dict(zip(("right", "left"), robot.drive.node_ids, strict=True))}
-    names = ("command", "feedback", "status")
-    return {"identifiers": dict(zip(names, sorted(identifiers(robot.drive, robot.index)[0]), strict=True))}
-
-
 def bench_lines(bench: Facts) -> list[str]:
     """Returns the same in lines for people."""
     lines = [f"bus {bus['name']}: {bus['url']}; to listen: {bus['listen']}" for bus in bench["buses"]]
     width = max(len(robot["name"]) for robot in bench["robots"])
     for robot in bench["robots"]:
-        if "nodes" in robot:
-            place = "nodes " + ", ".join(f"{node} {wheel}" for wheel, node in robot["nodes"].items())
-        else:
-            place = ", ".join(f"{kind} {can_id:#05x}" for kind, can_id in robot["identifiers"].items())
-        lines.append(f"  {robot['name']:<{width}}  {robot['protocol']} on {robot['bus']}, {place}")
+        lines.append(f"  {robot['name']:<{width}}  {robot['protocol']} on {robot['bus']}, {robot['place']}")
     period_ms, watchdog_ms = 1e3 * bench["period"], 1e3 * bench["watchdog"]
     return [*lines, f"they report every {period_ms:g} ms, and stop after {watchdog_ms:g} ms without a command"]
 

@@ -48,17 +48,12 @@ class ExportOptions:
 def export(options: ExportOptions) -> int:
     """Writes a run as CSV."""
     from echelon.sim.export import export_csv
-    from echelon.sim.recording import read_links
-    from echelon.sim.run_folder import read_run
+    from echelon.sim.run_folder import open_run
 
-    trace = read_run(options.run).trace
-    try:
-        links = [counts for _, counts in read_links(options.run / "run.mcap")]
-    except ValueError as error:  # which begins with the file
-        raise UsageError(str(error)) from None
+    run = open_run(options.run)
     folder = options.csv or options.run / "csv"
     try:
-        files = export_csv(trace, links, folder)
+        files = export_csv(run, folder)
     except OSError as error:
         what = folder if options.csv is None else f"--csv {folder}"
         raise UsageError(f"{what}: {error.strerror}") from None

@@ -1,18 +1,12 @@
 """`echelon run`: from what the user typed to a run, its folder, and the exit code."""
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 from echelon.cli.options import Command, option
 from echelon.cli.shared import ScenarioOptions, seconds
-from echelon.errors import UsageError, UserError
-
-if TYPE_CHECKING:
-    from echelon.plan import Plan
-    from echelon.scenario import Scenario
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,89 +46,38 @@ def run(options: RunOptions) -> int:
         from echelon.sim.children import warm_up
 
         warm_up()
-    from echelon.cli.bus_urls import bus_urls
     from echelon.cli.scenario_file import read_scenario
-    from echelon.sim.live import Display
+    from echelon.sim.launch import Launch, launch
     from echelon.sim.results.rendering import json_text
     from echelon.sim.results.summary import summary_text
-    from echelon.sim.run import execute
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
-    can_urls = bus_urls(plan, options.can, options.engine == "inprocess")
-    _check(plan, options, can_urls)
-    folder = _folder(scenario, options.out)
-    display = Display(plan, quiet=options.quiet)
-    if not options.quiet:
-        display.say(_heading(plan, options, folder, can_urls))
     try:
-        finished = execute(
+        finished = launch(
             scenario,
             plan,
-            folder,
-            engine=options.engine,
-            clock=options.clock,
-            can_urls=can_urls,
-            display=display,
-            stall_timeout_s=options.stall_timeout,
+            Launch(
+                engine=options.engine,
+                clock=options.clock,
+                out=options.out,
+                can=options.can,
+                report=not options.no_report,
+                quiet=options.quiet,
+                stall_timeout_s=options.stall_timeout,
+            ),
         )
     except OSError as error:
-        print(f"echelon: {error.filename or folder}: {error.strerror or error}", file=sys.stderr)
+        print(f"echelon: {error.filename}: {error.strerror or error}", file=sys.stderr)
         return 3
-    finally:
-        display.close()
-    failure = finished.failure
-    if not options.no_report:
-        try:
-            from echelon.sim.run_folder import report_on  # matplotlib, when it is needed
-
-            report_on([folder], folder / "report.html")
-        except (UserError, OSError) as error:  # of a run that broke off there may be nothing to report
-            failure = failure or f"no report: {error}"
     if options.json:
         print(json_text(finished.summary))
     else:
         print(summary_text(finished.summary))
-        print(f"  folder   {folder}")
-    if failure:
+        print(f"  folder   {finished.folder}")
+    if failure := finished.failure or finished.report_failure:
         print(f"echelon: {failure}", file=sys.stderr)
         return 3
-    return 0 if finished.summary.verdict.holds else 1
-
-
-def _check(plan: "Plan", options: RunOptions, can_urls: Sequence[str]) -> None:
-    """Raises UsageError for options that do not go together."""
-    from echelon.cli.bus_urls import check_wall_clock
-
-    if options.clock == "wall":
-        if plan.can.closed and (not can_urls or options.engine == "inprocess"):
-            raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
-        check_wall_clock(plan, can_urls)
-    if plan.can.closed and options.engine == "processes" and not can_urls:
-        raise UsageError("--can none: the closed torque path of several processes needs a bus; or --engine inprocess")
-    if plan.can.closed and options.engine == "processes" and any(url.startswith("virtual") for url in can_urls):
-        raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
-    if options.clock == "virtual" and not plan.can.virtual_drives:
-        raise UsageError("can.virtual_drives = false: real drives need --clock wall")
-
-
-def _folder(scenario: "Scenario", out: Path | None) -> Path:
-    """Returns the folder of the run, made.  Raises UsageError."""
-    from echelon.sim.run import new_folder
-
-    try:
-        return new_folder(scenario, out)
-    except OSError as error:
-        if out is not None:
-            raise UsageError(f"--out {out}: {error.strerror}") from None
-        raise UsageError(f"{error.filename}: {error.strerror}; give a folder with --out") from None
-
-
-def _heading(plan: "Plan", options: RunOptions, folder: Path, can_urls: Sequence[str]) -> str:
-    robots, nodes = len(plan.robots), len(plan.nodes)
-    how = "in one process" if options.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
-    bus = f", frames on {', '.join(can_urls)}" if can_urls else ""
-    path = f", {plan.can.path} torque path" if plan.can.closed else ""
-    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{path}{bus}; into {folder}"
+    return 0 if finished.holds else 1
 
 
 COMMANDS: Final = (

@@ -60,7 +60,7 @@ def in_one_process(scenario: Path, overrides: Sequence[str], folder: Path) -> st
     display = Display(plan, quiet=True)
     done = execute(loaded, plan, folder, engine="inprocess", clock="virtual", can_urls=(), display=display)
     assert done.failure is None
-    return str(done.summary["trace_digest"])
+    return str(done.summary.trace_digest)
 
 
 def as_processes(

@@ -20,10 +20,10 @@ from echelon import __version__
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
+from echelon.errors import PartRunError
 from echelon.loading import effective_toml
 from echelon.messages import Message
 from echelon.plan import Plan
-from echelon.plugins import PartRunError
 from echelon.scenario import Scenario
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display

@@ -14,7 +14,7 @@ from synthetic import run_facts
 
 from echelon.bridge.fit import plan_fit
 from echelon.cli.new_scenario import scenario_text, sizes
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.scenario import Scenario
 from echelon.schema import reference_page, scenario_schema
 from echelon.shipped import shipped

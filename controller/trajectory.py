@@ -36,7 +36,7 @@ class Line(Trajectory):
     """z_cd = start + velocity t"""
 
     start: Point = (0.0, 0.0)
-    """[m]"""
+    """Where the centroid is to be at time 0 [m]"""
     velocity: Point
     """[m/s]"""
 
@@ -54,9 +54,9 @@ class Circle(Trajectory):
     radius: Positive
     """[m]"""
     rate: Finite
-    """[rad/s]"""
+    """[rad/s]; negative: clockwise"""
     phase: Finite = 0.0
-    """[rad]"""
+    """Where on the circle at time 0, in radians [rad]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -71,9 +71,9 @@ class Sine(Trajectory):
     """z_cd = start + (speed t, amplitude sin(rate t)): the paper's, with speed 1, amplitude 30, rate 0.1"""
 
     start: Point = (0.0, 0.0)
-    """[m]"""
+    """Where the centroid is to be at time 0 [m]"""
     speed: Finite
-    """[m/s]"""
+    """Along the x axis [m/s]"""
     amplitude: Finite
     """[m]"""
     rate: Finite
@@ -100,7 +100,7 @@ class Waypoints(Trajectory):
     """
 
     points: Annotated[list[Point], Field(min_length=2)]
-    """[m]"""
+    """Where the centroid is to be, one after the other [m]"""
     times: Annotated[list[NonNegative], Field(min_length=2)]
     """When to be at each point [s], ascending"""
 

@@ -40,6 +40,9 @@ HEAD: Final = """\
 All keys of a scenario, made from their source by `make docs`.  `echelon schema scenario` prints the same as a JSON schema
 for editors, `echelon validate FILE` checks a file, and `echelon new NAME` writes one to begin with.
 
+A part of your own (a trajectory, a plant) is a class in a Python file beside the scenario:
+`trajectory = { use = "my_paths.py:Spiral", parameters = { … } }`.
+
 """
 
 
@@ -78,9 +81,11 @@ def _with_parts(schema: Any, registry: Registry) -> Any:
     if PART not in schema:
         return {key: _with_parts(value, registry) for key, value in schema.items()}
     built_in, use = registry.groups[schema[PART]].built_in, {"$ref": f"#/$defs/{USE}"}
+    other = {"type": "string", "not": {"enum": list(built_in)}}  # an installed one, which may take any parameters
     if schema[BESIDE]:
-        return {"oneOf": [*({"$ref": f"#/$defs/{part.__name__}"} for part in built_in.values()), use]}
-    return {"oneOf": [{"enum": list(built_in)}, {"type": "string", "pattern": r"\.py:"}, use]}
+        installed = {"type": "object", "properties": {KIND: other}, "required": [KIND]}
+        return {"oneOf": [*({"$ref": f"#/$defs/{part.__name__}"} for part in built_in.values()), installed, use]}
+    return {"oneOf": [{"enum": list(built_in)}, other, use]}
 
 
 def reference_page(registry: Registry) -> str:

@@ -8,17 +8,20 @@ from typing import Any
 
 import cantools
 import pytest
+from jsonschema import Draft202012Validator
 from runs import ROOT, echelon, summary_of
 from synthetic import run_facts
 
 from echelon.bridge.fit import plan_fit
 from echelon.cli.new_scenario import scenario_text, sizes
+from echelon.loading import effective_toml
 from echelon.scenario import Scenario
 from echelon.schema import reference_page, scenario_schema
 from echelon.shipped import shipped
 from echelon.sim.engine import Engine
 from echelon.sim.parts import REGISTRY, parse
 from echelon.sim.results.records import Verdict
+from echelon.sim.results.rendering import summary_schema
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import TraceBuilder
 
@@ -198,27 +201,63 @@ def test_the_schema_has_exactly_the_keys_that_are_known() -> None:
     assert schema == json.loads(json.dumps(scenario_schema(REGISTRY)))
     assert list(schema["properties"]) == list(Scenario.model_fields)
     assert schema["required"] == ["name", "duration", "formation", "trajectory"]
-    assert "null" not in json.dumps(schema)
+    assert '"null"' not in json.dumps(schema)
+    assert ": null" not in json.dumps(schema)
     assert schema["$defs"]["RobotTable"]["properties"]["heading"]["description"].endswith(
         "in radians [rad]; 0 unless given"
     )
     assert "[°]" in schema["$defs"]["Shape"]["properties"]["rotation"]["description"]
 
 
-def test_references_lead_somewhere() -> None:
-    schema = scenario_schema(REGISTRY)
+JUDGE = Draft202012Validator(scenario_schema(REGISTRY))
 
-    def check(part: Any) -> None:
-        if isinstance(part, dict):
-            if "$ref" in part:
-                assert part["$ref"].removeprefix("#/$defs/") in schema["$defs"]
-            for value in part.values():
-                check(value)
-        elif isinstance(part, list):
-            for value in part:
-                check(value)
 
-    check(schema)
+@pytest.mark.parametrize("name", shipped())
+def test_editors_find_nothing_wrong_with_a_scenario_or_what_a_run_makes_of_it(name: str) -> None:
+    Draft202012Validator.check_schema(JUDGE.schema)
+    text = shipped()[name].read_text(encoding="utf-8")
+    for each in (text, effective_toml(parse(text, "t.toml")[0])):
+        assert [error.message for error in JUDGE.iter_errors(tomllib.loads(each))] == []
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("duration = 40.0", "duratoin = 40.0"),
+        ("duration = 40.0", "duration = '40'"),
+        ("mass = 4.0", "mass = -4.0"),
+        ("mass = 4.0", "maas = 4.0"),
+        ("r1 = {", "R1 = {"),
+        ('kind = "circle"', 'kind = "line"'),
+        ("radius = 1.5", "raduis = 1.5"),
+        ('time_scales = "three"', 'time_scales = "four"'),
+        ("start = [0.0, -1.3]", "start = [0.0]"),
+    ],
+)
+def test_editors_find_what_is_wrong(before: str, after: str) -> None:
+    assert before in LAB
+    assert list(JUDGE.iter_errors(tomllib.loads(LAB.replace(before, after, 1))))
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        'trajectory = { use = "my.py:Path", parameters = { x = 1 } }',
+        'trajectory = { use = "circle", parameters = { radius = 1.0, rate = 0.1 } }',
+        'trajectory = { kind = "installed", x = 1 }',
+        'robot.model = "my.py:Slipping"',
+        'robot.model = "installed"',
+        'robot.model = { use = "my.py:Slipping", parameters = { slip = 0.1 } }',
+    ],
+)
+def test_editors_allow_parts_that_others_wrote(written: str) -> None:
+    assert [error.message for error in JUDGE.iter_errors(tomllib.loads(LAB) | tomllib.loads(written))] == []
+
+
+def test_the_schema_of_a_summary_is_there_too() -> None:
+    assert json.loads(echelon("schema", "summary").stdout) == summary_schema()
+    refused = echelon("schema", "summary", "--markdown")
+    assert refused.stderr == "echelon: --markdown: is for scenario, not for summary\n"
 
 
 def test_the_reference_page_is_up_to_date() -> None:

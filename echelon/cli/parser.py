@@ -78,7 +78,7 @@ ENTRIES: Final = {
     "validate": Entry("check a scenario and say what it means", _scenario),
     "analyse": Entry("compute how much delay a scenario's control law bears", _scenario),
     "dbc": Entry("print the DBC of a scenario's drives, for cantools, SavvyCAN and the like", _scenario),
-    "schema": Entry("print the schema of scenario files, for editors, or a reference of all keys", _scenario),
+    "schema": Entry("print the schema of scenario files, for editors, or of summaries", _scenario),
     "report": Entry("write the report of a run, or a comparison of several", _results),
     "export": Entry("write a run as CSV: robots.csv, blocks.csv, links.csv", _results),
     "recover": Entry("mend a recording that was cut off", _results),

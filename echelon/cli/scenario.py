@@ -205,7 +205,7 @@ class SchemaOptions:
     what: Literal["scenario", "summary"] = field(
         metadata=argument("scenario: the keys of scenario files; summary: those of a run's summary.json", "WHAT")
     )
-    markdown: bool = field(default=False, metadata=option("print a reference page for people, Markdown"))
+    markdown: bool = field(default=False, metadata=option("of scenarios: print a reference page for people, Markdown"))
 
 
 def schema(options: SchemaOptions) -> int:
@@ -301,10 +301,11 @@ and the like.  A run leaves the same in its folder.""",
 Prints the JSON schema of scenario files: with it an editor completes keys, shows what they
 mean, and marks mistakes.  In VS Code (Even Better TOML), Helix or Zed (taplo), the line
   #:schema ./scenario.schema.json
-at the top of a scenario does that.""",
+at the top of a scenario does that.  Or prints the schema of summary.json, for scripts.""",
         examples={
             "echelon schema scenario > scenario.schema.json": "for editors",
             "echelon schema scenario --markdown": "all keys with their defaults and units, for people",
+            "echelon schema summary": "what is in the summary of a run",
         },
         codes={0: "printed"},
     ),

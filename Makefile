@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 LOCKS := requirements.lock requirements-dev.lock requirements-bench.lock
 
-.PHONY: help setup demo test lint bench lock clean
+.PHONY: help setup demo docs test lint bench lock clean
 help: ## what can be made
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
 
@@ -35,6 +35,10 @@ demo: $(VENV)/.run ## the paper's nine robots as processes over Zenoh, without a
 	$(BIN)/echelon run paper --set avoidance.enabled=true --out runs/demo-avoidance
 	$(BIN)/echelon report runs/demo runs/demo-avoidance --out runs/demo.html
 	@echo "Look at runs/demo.html in a browser; runs/demo/ holds the recording, the CAN log and the summary."
+
+docs: $(VENV)/.run ## docs/scenario.md and docs/summary.schema.json, from their source
+	$(BIN)/echelon schema scenario --markdown > docs/scenario.md
+	$(BIN)/echelon schema summary > docs/summary.schema.json
 
 test: $(VENV)/.dev ## all tests
 	$(BIN)/python -m pytest $(ARGS)

@@ -25,13 +25,13 @@ from echelon.bridge.bus_url import resolve_url
 from echelon.bridge.commander import RobotChannel
 from echelon.bridge.frame import Frame
 from echelon.bridge.protocols import drive_places, make_drive
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan import Plan
+from echelon.shipped import shipped
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load
 from echelon.sim.supervisor import Supervisor
-from echelon.sim.usage import SCENARIOS
 
 CYCLES: Final = 500
 """Of nine frames each."""
@@ -43,7 +43,7 @@ NEVER_NS: Final = 1 << 62
 
 def lab(*overrides: str) -> tuple[Any, Plan]:
     """Returns lab.toml with a closed torque path."""
-    return load(SCENARIOS / "lab.toml", ["can.path=closed", "claims=[]", *overrides])
+    return load(shipped()["lab"], ["can.path=closed", "claims=[]", *overrides])
 
 
 class Robots:

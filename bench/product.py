@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from echelon.bridge.bus_url import resolve_url
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
+from echelon.shipped import shipped
 from echelon.sim.engine import Engine
 from echelon.sim.live import Display
 from echelon.sim.parts import load
 from echelon.sim.run import execute
 from echelon.sim.supervisor import Supervisor
-from echelon.sim.usage import SCENARIOS
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Row:
 
 def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float, float, float]:
     """Runs `seconds` of paper.toml as processes; returns ticks/s, start-up [s], most memory of a robot process [MB]."""
-    scenario, plan = load(SCENARIOS / "paper.toml", [f"duration={seconds}"])
+    scenario, plan = load(shipped()["paper"], [f"duration={seconds}"])
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         outcome = Supervisor(
             plan,
@@ -55,11 +55,11 @@ def lab_in_process(*, whole: bool) -> float:
     """Runs lab.toml in this process; returns how many times faster than real time.
 
     `whole`: with recording and frames on a virtual bus; otherwise roles and links alone."""
-    scenario, plan = load(SCENARIOS / "lab.toml")
+    scenario, plan = load(shipped()["lab"])
     if whole:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             display = Display(plan, quiet=True)
-            done = execute(
+            summary, _ = execute(
                 scenario,
                 plan,
                 Path(folder),
@@ -68,7 +68,7 @@ def lab_in_process(*, whole: bool) -> float:
                 can_urls=("virtual",),
                 display=display,
             )
-        return float(done.summary.run.real_time_factor or 0.0)
+        return float(summary.run.real_time_factor or 0.0)
     engine = Engine(plan)
     begun_s = time.perf_counter()
     engine.run()

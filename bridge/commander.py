@@ -18,15 +18,15 @@ from echelon.bridge.bus_load import worst_case_bits
 from echelon.bridge.bus_model import BusEventKind
 from echelon.bridge.bus_time import BusTime
 from echelon.bridge.buses import make_buses
-from echelon.bridge.cia402.host import Master
 from echelon.bridge.disturbances import Disturbances
 from echelon.bridge.envelope import Envelope
 from echelon.bridge.frame import Frame, Host
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
 from echelon.bridge.ideal_bus import IdealBus
-from echelon.bridge.protocols import drive_places, make_host
+from echelon.bridge.protocols import drive_places, make_host, make_masters
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.schedule import Schedule
+from echelon.errors import PartRunError
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
 from echelon.plan import Plan, RobotPlan
 from echelon.role import Input, Stage
@@ -94,10 +94,22 @@ class RobotChannel:
             return 0.0, 0.0
         return self.host.torque
 
+    def stop(self, time_ns: int) -> tuple[list[Frame], str]:
+        """Returns frames that take the torque away and disable the drives.  If the host of somebody else's protocol fails at
+        that, they only ask for no torque, as far as it can say that; and the text says what failed."""
+        try:
+            return self.host.stop(time_ns), ""
+        except PartRunError as error:
+            failure = str(error)
+        try:
+            return self.host.mirror(0.0, 0.0, False), failure
+        except PartRunError:
+            return [], failure  # the drives' own watchdogs are left
+
     def report(self) -> WheelsReport:
         """Returns the counts."""
         return WheelsReport(
-            protocol=self.robot.drive.protocol,
+            protocol=self.robot.drive.protocol.use,
             commands=self.commands,
             stopped=dict(sorted(self.stopped.items())),
             largest=self.largest,
@@ -127,11 +139,7 @@ class Commander:
             listeners = self._listeners[robot.robot.drive.bus]
             listeners.update(dict.fromkeys(robot.host.identifiers, robot.host))
         self._longest_ns = [-(-worst_case_bits(8) * 1_000_000_000 // bus.bitrate) for bus in plan.can.buses]
-        self._masters = {
-            bus: Master(self._period_ns, plan.can.watchdog_ns)
-            for bus in range(len(self.buses))
-            if any(robot.drive.protocol == "cia402" and robot.drive.bus == bus for robot in plan.robots)
-        }
+        self._masters = make_masters(plan)
         self._places = drive_places(plan)
         self._estops = Schedule(event for event in plan.events if event.kind == "estop")
         self._stopped: set[int] = set()
@@ -180,11 +188,13 @@ class Commander:
         for robot, message in zip(self.robots, heard, strict=True):
             self._queue(time_ns, robot.robot.drive.bus, robot.frames(time_ns, message))
         end_ns = time_ns + self._period_ns
-        for bus, master in self._masters.items():
+        for bus, master in self._masters:
             self._queue(time_ns, bus, master.poll(time_ns))
-        for bus, master in self._masters.items():
+        for bus, master in self._masters:
+            if (sync := master.sync()) is None:
+                continue
             # It ends with the period, so that all drives sample then, even if another frame has just begun.
-            sync, model = master.sync(), self.buses[bus]
+            model = self.buses[bus]
             lead_ns = model.duration_ns(sync) + (0 if isinstance(model, IdealBus) else self._longest_ns[bus])
             self._queue(max(time_ns, end_ns - lead_ns), bus, [sync])
         carried = [
@@ -222,7 +232,11 @@ class Commander:
 
     def bus_frames(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Returns, bus by bus, what is sent once per period whatever robots there are; on a wall clock, at its start."""
-        return [(bus, [master.sync(), *master.poll(time_ns)]) for bus, master in self._masters.items()]
+        frames = []
+        for bus, master in self._masters:
+            sync = master.sync()
+            frames.append((bus, [*([] if sync is None else [sync]), *master.poll(time_ns)]))
+        return frames
 
     def reported_since(self, time_ns: int) -> bool:
         """True if every robot's drives have reported their torques since an instant."""
@@ -231,6 +245,12 @@ class Commander:
     def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
         for frame in frames:
             self.buses[bus].send(time_ns, BRIDGE_NODE, frame)  # what finds no room is counted there
+
+    def stop(self, time_ns: int) -> tuple[list[TimedFrame], str]:
+        """Returns frames that take the torque away from all wheels and disable their drives; and what failed, if anything."""
+        stopped = [(robot.robot.drive.bus, robot.stop(time_ns)) for robot in self.robots]
+        frames = [TimedFrame(time_ns, bus, BRIDGE_NODE, frame) for bus, (of_robot, _) in stopped for frame in of_robot]
+        return frames, next((failure for _, (_, failure) in stopped if failure), "")
 
     def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Makes happen what the scenario has for this instant; returns the frames of an e-stop, bus by bus."""

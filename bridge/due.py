@@ -11,15 +11,15 @@ where the plan has disturbances, pauses shorter than five of them, and frames in
 
 What may come early.  A sender that was held up may send what it owes at once, frames that follow each other within half a
 period, until one is due again; with the first that does not follow so it has caught up, and what has not come is lost.  A
-remote frame asks for one more as well, and a command for no torque may come at any time.  A CANopen node that boots begins
-anew.
+remote frame asks for one more as well, and a command for no torque may come at any time.  A drive that boots, and says so,
+begins anew.
 """
 
+from collections.abc import Mapping
 from math import ceil
 from typing import Final
 
 from echelon.bridge.bus_load import worst_case_bits
-from echelon.bridge.cia402.codec import HEARTBEAT_ID, TPDO_IDS
 from echelon.bridge.frame import Frame
 from echelon.bridge.reports import TimingReport
 from echelon.bridge.wheel_check import WheelCheck
@@ -199,8 +199,8 @@ class Lane:
         self.scan_ns = -NEVER_NS
         self.watches: dict[int, Watch] = {}
         """By identifier"""
-        self.boot_ups: dict[int, list[Watch]] = {}
-        """What begins anew with a CANopen boot-up message, by its identifier"""
+        self.boot_ups: dict[tuple[int, bytes], list[Watch]] = {}
+        """What begins anew with a frame, by its identifier and data"""
 
     def add(self, can_id: int, period_ns: int, tolerance_ns: int | None = None) -> Watch:
         """Returns the watch of an identifier, a new one if there is none; period 0: it comes as it likes."""
@@ -211,11 +211,10 @@ class Lane:
                 watch.shift_ns = NEVER_NS
         return watch
 
-    def add_boot_ups(self, nodes: tuple[int, int]) -> None:
-        """Takes note of CANopen drives."""
-        for node in nodes:
-            own = [base + node for base in (*TPDO_IDS, HEARTBEAT_ID)]
-            self.boot_ups[HEARTBEAT_ID + node] = [self.watches[can_id] for can_id in own if can_id in self.watches]
+    def add_boot_ups(self, boot_ups: Mapping[tuple[int, bytes], frozenset[int]]) -> None:
+        """Takes note of frames with which identifiers begin anew."""
+        for frame, can_ids in boot_ups.items():
+            self.boot_ups[frame] = [self.watches[can_id] for can_id in sorted(can_ids) if can_id in self.watches]
 
     @property
     def first_ns(self) -> int | None:

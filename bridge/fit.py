@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from echelon.bridge.bus_load import worst_case_bits
-from echelon.bridge.cia402.codec import SYNC_ID
-from echelon.bridge.protocols import dbc_messages, make_observer, shared_cyclic
+from echelon.bridge.protocols import cyclic_of, dbc_messages, make_observer, shared_cyclic, shared_messages
 from echelon.bridge.response_time import Stream, advice, fits, load, response_times
 from echelon.plan import Plan
 
@@ -41,20 +40,20 @@ class Fit:
 
 def robot_streams(plan: Plan, robot: int) -> list[Stream]:
     """Returns the cyclic frames of a robot and its drives; of those only the torques where nobody answers."""
-    one = plan.robots[robot]
-    messages = {message.frame_id: message for message in dbc_messages(one.drive, "robot", robot)}
+    one, closed = plan.robots[robot], plan.can.closed
+    lengths = {message.frame_id: message.length for message in dbc_messages(one, "robot")}
     return [
-        Stream(can_id, period_ns, worst_case_bits(messages[can_id].length))
-        for can_id, period_ns in make_observer(one).cyclic.items()
-        if plan.can.closed or messages[can_id].senders == ["bridge"]
+        Stream(can_id, period_ns, worst_case_bits(lengths[can_id]))
+        for can_id, period_ns in cyclic_of(one, make_observer(one, closed), closed).items()
     ]
 
 
 def bus_fit(plan: Plan, bus: int) -> Fit:
     """Returns how the plan's frames fit one of its buses."""
     robots = {robot.name: robot_streams(plan, robot.index) for robot in plan.robots if robot.drive.bus == bus}
+    lengths = {message.frame_id: message.length for message in shared_messages(plan, bus)}
     shared = [
-        Stream(can_id, period_ns, worst_case_bits(0 if can_id == SYNC_ID else 1))
+        Stream(can_id, period_ns, worst_case_bits(lengths[can_id]))
         for on, can_id, period_ns in shared_cyclic(plan)
         if on == bus and plan.can.closed
     ]

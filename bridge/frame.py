@@ -1,6 +1,6 @@
-"""What all drive protocols share: the frame, and what a virtual drive and its host are to those who run them.
+"""What all drive protocols share: the frame, and what a virtual drive, its host and a bus's master are to those who run them.
 
-Both are plain objects: frames and the time in, frames out.  They never wait, read no clock and send nothing themselves.
+All are plain objects: frames and the time in, frames out.  They never wait, read no clock and send nothing themselves.
 What comes from the bus is checked, counted in `refused`, and dropped; it never raises.
 """
 
@@ -68,14 +68,20 @@ class Host(Protocol):
 
     refused: Counter[str]
     """Frames that were refused, by reason."""
-    torque: tuple[float, float]
-    """Torque of the right and left wheel as the drives last reported it [N m]; zeros before the first report."""
-    torque_ns: int | None
-    """When that report came; None before the first."""
+    clipped: int
+    """Torques that were cut to what a frame can carry."""
 
     @property
     def identifiers(self) -> frozenset[int]:
         """Identifiers of the frames it listens to."""
+
+    @property
+    def torque(self) -> tuple[float, float]:
+        """Torque of the right and left wheel as the drives last reported it [N m]; zeros before the first report."""
+
+    @property
+    def torque_ns(self) -> int | None:
+        """When that report came; None before the first."""
 
     @property
     def enabled(self) -> bool:
@@ -104,3 +110,17 @@ class Host(Protocol):
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""
+
+    def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
+        """Returns the frames that carry wheel torques [N m], finite ones, and nothing else, whatever drives say: those of a
+        mirrored torque path, where nobody answers.  Unless `enable`, they ask for no torque."""
+
+
+class Master(Protocol):
+    """What a bus has one of, whatever the number of robots on it: who keeps its time."""
+
+    def poll(self, time_ns: int) -> list[Frame]:
+        """Returns what is due; to be called once per period, early or late by less than half of it."""
+
+    def sync(self) -> Frame | None:
+        """Returns the frame whose end is the end of a period, if there is one: drives sample then what they report."""

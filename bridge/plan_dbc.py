@@ -7,11 +7,11 @@ from typing import Any
 from cantools.database import Database
 from cantools.database.can import Node
 
-from echelon.bridge.native.dbc import KINDS
-from echelon.bridge.protocols import dbc_messages
+from echelon.bridge.protocols import dbc_messages, shared_messages
 from echelon.plan import Plan
 
-_LONGEST = 32 - len("_") - max(map(len, KINDS))  # a DBC identifier has at most 32 characters
+_LONGEST = 23
+"""A DBC identifier has up to 32 characters; protocols add up to 9."""
 
 
 def identifiers(robots: Sequence[str]) -> list[str]:
@@ -33,7 +33,8 @@ def plan_dbc(plan: Plan, bus: int = 0) -> str:
     messages: list[Any] = []
     for robot, name in zip(plan.robots, names, strict=True):
         if robot.drive.bus == bus:
-            messages += dbc_messages(robot.drive, name, robot.index)
+            messages += dbc_messages(robot, name)
+    messages += shared_messages(plan, bus)
     nodes = dict.fromkeys(
         node
         for message in messages

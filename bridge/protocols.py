@@ -1,22 +1,34 @@
-"""The drive protocols by their names in a scenario: which host, drives, observer and DBC messages go with each."""
+"""The registry of drive protocols that are built in, and what the robots of a plan have of theirs.
 
-from collections.abc import Callable
-from importlib import import_module
-from typing import Any, Final, NamedTuple
+What a protocol makes that others wrote comes checked (bridge.checked).
+"""
 
-from echelon.bridge.cia402.codec import HEARTBEAT_ID, HOST_NODE, SYNC_ID
-from echelon.bridge.cia402.configuration import heartbeat_ns
-from echelon.bridge.frame import Drive, Host
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from echelon.bridge.checked import CheckedDrive, CheckedHost, CheckedMaster, CheckedObserver
+from echelon.bridge.cia402 import Cia402
+from echelon.bridge.frame import Drive, Host, Master
+from echelon.bridge.native import Native
 from echelon.bridge.observe import Observer
-from echelon.can_plan import DrivePlan
+from echelon.bridge.odrive import ODrive
+from echelon.bridge.protocol import DriveProtocol
 from echelon.plan import Plan, RobotPlan
+from echelon.plugins import Part, Plugin
 
-PREFIX: Final = {"native": "Native", "odrive": "ODrive", "cia402": "Cia402"}
-"""How the classes of a protocol begin; its modules are `bridge.<protocol>.host` and so on."""
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+PROTOCOLS: Final[dict[str, type[Plugin]]] = {"native": Native, "odrive": ODrive, "cia402": Cia402}
+"""What is built in, by name."""
+DEFAULT: Final = "native"
+"""What robots have whose scenario names none."""
 
 
-def _part(protocol: str, module: str, kind: str) -> Any:
-    return getattr(import_module(f"echelon.bridge.{protocol}.{module}"), PREFIX[protocol] + kind)
+def protocol_of(robot: RobotPlan) -> DriveProtocol:
+    """Returns the protocol of a robot's drives."""
+    protocol: DriveProtocol = robot.drive.protocol.made
+    return protocol
 
 
 class DrivePlace(NamedTuple):
@@ -32,62 +44,93 @@ def drive_places(plan: Plan) -> list[DrivePlace]:
     """Lists the drives of a plan; their nodes are numbered from 1 on, after the bridge."""
     places: list[DrivePlace] = []
     for robot in plan.robots:
-        for wheels in ((0, 1),) if robot.drive.protocol == "native" else ((0,), (1,)):
+        for wheels in protocol_of(robot).wheels:
             places.append(DrivePlace(robot.index, wheels, robot.drive.bus, len(places) + 1))
     return places
 
 
 def make_host(robot: RobotPlan) -> Host:
     """Returns what commands a robot's drives."""
-    host: Host = _part(robot.drive.protocol, "host", "Host")(robot.drive, robot.index)
-    return host
+    return protocol_of(robot).host(robot.drive) if robot.drive.protocol.is_own else CheckedHost(robot)
 
 
 def make_drive(plan: Plan, place: DrivePlace) -> Drive:
     """Returns a virtual drive."""
-    drive = plan.robots[place.robot].drive
-    which = place.robot if drive.protocol == "native" else place.wheels[0]
-    made: Drive = _part(drive.protocol, "drive", "Drive")(drive, which)
-    return made
+    robot = plan.robots[place.robot]
+    number = protocol_of(robot).wheels.index(place.wheels)
+    return protocol_of(robot).drive(robot.drive, number) if robot.drive.protocol.is_own else CheckedDrive(robot, number)
 
 
-def make_observer(robot: RobotPlan) -> Observer:
-    """Returns what listens to a robot's frames."""
-    observer: Observer = _part(robot.drive.protocol, "observe", "Observer")(robot.drive, robot.envelope, robot.index)
-    return observer
+def make_observer(robot: RobotPlan, closed: bool) -> Observer:
+    """Returns what listens to a robot's frames; not `closed`: nobody answers."""
+    if robot.drive.protocol.is_own:
+        return protocol_of(robot).observer(robot.drive, robot.envelope, closed)
+    return CheckedObserver(robot, closed)
+
+
+def cyclic_of(robot: RobotPlan, observer: Observer, closed: bool) -> dict[int, int]:
+    """Returns which identifiers of a robot come regularly, with their periods [ns]: what the observer says, or where nobody
+    answers, torques alone, once per acceleration period."""
+    if closed:
+        return observer.cyclic
+    return {frame.can_id: robot.period_ns for frame in make_host(robot).mirror(0.0, 0.0, True)}
+
+
+class SharedProtocol(NamedTuple):
+    """A protocol that is spoken on a bus, as one of its robots there has it; times are the smallest of all robots there."""
+
+    bus: int
+    part: Part[Any]
+    period_ns: int
+    watchdog_ns: int
+
+    @property
+    def made(self) -> DriveProtocol:
+        """The protocol."""
+        made: DriveProtocol = self.part.made
+        return made
+
+
+def shared_protocols(plan: Plan) -> Iterator[SharedProtocol]:
+    """Yields the protocols that are spoken on each bus."""
+    for bus in range(len(plan.can.buses)):
+        drives = [robot.drive for robot in plan.robots if robot.drive.bus == bus]
+        for part in {drive.protocol.use: drive.protocol for drive in reversed(drives)}.values():
+            yield SharedProtocol(bus, part, min(drive.period_ns for drive in drives), plan.can.watchdog_ns)
+
+
+def make_masters(plan: Plan) -> list[tuple[int, Master]]:
+    """Returns what a bus has one of, whatever the number of robots, with the number of the bus."""
+    found = []
+    for one in shared_protocols(plan):
+        if one.part.is_own:
+            master = one.made.master(one.period_ns, one.watchdog_ns)
+        else:
+            master = CheckedMaster.made_by(one.part, one.period_ns, one.watchdog_ns)
+        if master is not None:
+            found.append((one.bus, master))
+    return found
 
 
 def shared_cyclic(plan: Plan) -> list[tuple[int, int, int]]:
-    """Returns what is cyclic on CANopen buses without being a robot's, SYNC and the host's heartbeat: bus, identifier,
-    period [ns]."""
-    found = []
-    for bus in sorted({robot.drive.bus for robot in plan.robots if robot.drive.protocol == "cia402"}):
-        period_ns = min(robot.drive.period_ns for robot in plan.robots if robot.drive.bus == bus)
-        found.append((bus, SYNC_ID, period_ns))
-        found.append((bus, HEARTBEAT_ID + HOST_NODE, heartbeat_ns(period_ns, plan.can.watchdog_ns)))
-    return found
+    """Returns what comes regularly on buses without being a robot's: bus, identifier, period [ns]."""
+    return [
+        (one.bus, can_id, period_ns)
+        for one in shared_protocols(plan)
+        for can_id, period_ns in one.made.shared_cyclic(one.period_ns, one.watchdog_ns).items()
+    ]
 
 
-def torque_frames(robot: RobotPlan) -> Callable[[float, float], list[tuple[int, bytes]]]:
-    """Returns what makes the frames of torques [N m], right and left, of a robot whose drives are not native: those
-    alone, as the mirrored path shows them."""
-    motor, (right, left) = robot.drive.motor, robot.drive.node_ids
-    if robot.drive.protocol == "odrive":
-        from echelon.bridge.odrive.codec import MESSAGES, frame_id
-        from echelon.bridge.odrive.enums import Command
-
-        torque, command = MESSAGES[Command.SET_INPUT_TORQUE], Command.SET_INPUT_TORQUE
-        ids = frame_id(right, command), frame_id(left, command)
-        return lambda *taus: [(can_id, torque.encode(tau)) for can_id, tau in zip(ids, taus, strict=True)]
-    from echelon.bridge.cia402.codec import RPDO2, RPDO_IDS, permille, rated_mnm
-
-    rated = rated_mnm(motor.rated_torque)
-    ids = RPDO_IDS[1] + right, RPDO_IDS[1] + left
-    return lambda *taus: [(can_id, RPDO2.pack(permille(tau, rated))) for can_id, tau in zip(ids, taus, strict=True)]
+def dbc_messages(robot: RobotPlan, name: str) -> "list[Message]":
+    """Returns the DBC messages of a robot's frames; `name` stands for the robot."""
+    return protocol_of(robot).messages(robot.drive, name)
 
 
-def dbc_messages(drive: DrivePlan, robot: str, number: int) -> list[Any]:
-    """Returns the DBC messages of a robot's drives."""
-    make = import_module(f"echelon.bridge.{drive.protocol}.dbc").messages
-    found: list[Any] = make(drive, robot, number) if drive.protocol == "native" else make(drive, robot)
-    return found
+def shared_messages(plan: Plan, bus: int) -> "list[Message]":
+    """Returns the DBC messages of a bus that are no robot's."""
+    return [
+        message
+        for one in shared_protocols(plan)
+        if one.bus == bus
+        for message in one.made.shared_messages(one.period_ns, one.watchdog_ns)
+    ]

@@ -30,7 +30,7 @@ from echelon.bridge.canlog import read_log
 from echelon.bridge.due import Lane
 from echelon.bridge.frame import Frame
 from echelon.bridge.observe import Finding, Observer
-from echelon.bridge.protocols import shared_cyclic
+from echelon.bridge.protocols import protocol_of, shared_cyclic
 from echelon.bridge.reports import FindingReport, RefereeReport
 from echelon.bridge.wheel_check import WheelCheck
 from echelon.can_plan import NEVER_NS
@@ -42,7 +42,6 @@ WAIT_NS: Final = 1_000_000_000
 """Feedback is taken to have waited for the bus no longer than this"""
 SCAN_NS: Final = 50_000_000
 """How often it is looked for identifiers that are silent"""
-BOOT_UP: Final = b"\0"
 
 
 class Referee:
@@ -72,13 +71,12 @@ class Referee:
             for can_id in sorted(robot.observer.identifiers):
                 watch = lane.add(can_id, robot.cyclic.get(can_id, 0), tolerance_ns)
                 watch.robots += (robot,)
-                watch.asked_empty = plan.can.closed and robot.plan.drive.protocol == "odrive"
+                watch.asked_empty = plan.can.closed and protocol_of(robot.plan).empty_asks
         if plan.can.closed:
             for bus, can_id, period_ns in shared_cyclic(plan):
                 self._lanes[bus].add(can_id, period_ns, tolerance_ns)
             for robot in self.robots:
-                if robot.plan.drive.protocol == "cia402":
-                    self._lanes[robot.plan.drive.bus].add_boot_ups(robot.plan.drive.node_ids)
+                self._lanes[robot.plan.drive.bus].add_boot_ups(protocol_of(robot.plan).boot_ups(robot.plan.drive))
 
     @property
     def observers(self) -> list[Observer]:
@@ -111,9 +109,9 @@ class Referee:
             self.unknown += 1
             return said
         untimely = watch.take(time_ns, begin_ns, lane.busy_ns, frame)
-        if frame.data == BOOT_UP and watch.can_id in lane.boot_ups:
+        if lane.boot_ups and (anew := lane.boot_ups.get((frame.can_id, frame.data))):
             untimely = None
-            for other in lane.boot_ups[watch.can_id]:
+            for other in anew:
                 other.forget()
         sampled_ns = max(lane.busy_ns, time_ns - WAIT_NS)
         for robot in watch.robots:

@@ -208,7 +208,7 @@ class CanReport:
     listen: str
     """What to type to hear them; empty if nobody else can"""
     torque_scale: float
-    """Of the native frame [N m per bit]"""
+    """Of frames with torques in whole numbers [N m per bit]"""
     log_start: float
     """Run time of the first instant of can.log [s]: before 0 where drives are brought up"""
     frames: int

@@ -7,18 +7,15 @@ does not let pass.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from echelon.bridge.bus_load import BitCount
 from echelon.bridge.envelope import Envelope
-from echelon.bridge.native.codec import MAX_ROBOTS, NativeCodec, frame_id
+from echelon.bridge.frame import Frame, Host
 from echelon.bridge.reports import WheelsReport
 from echelon.can_plan import EnvelopePlan
-
-Frame = tuple[int, bytes]
-"""CAN identifier (11 bits) and data (8 bytes)."""
 
 
 class Stop(StrEnum):
@@ -47,18 +44,14 @@ class RobotCounts:
 
 
 class TorqueMirror:
-    """Turns torques into frames: native ones, or those of another protocol.
+    """Turns torques into frames.
 
-    Parameters: the robots' path names in the order of their numbers, the torque scale [N m per bit], the acceleration
-    period [ns], the robots' envelopes (none: no limits), and how torques become frames where they are not native, by
-    robot. Raises ValueError for more robots than identifiers, or a scale or period that is not positive."""
+    Parameters: the robots' hosts in the order of their numbers, the acceleration period [ns], and the robots' envelopes
+    (none: no limits). Raises ValueError for a period that is not positive."""
 
     __slots__ = (
-        "_codec",
-        "_counters",
         "_envelopes",
-        "_makers",
-        "_names",
+        "_hosts",
         "_period_ns",
         "counts",
         "frames",
@@ -66,24 +59,17 @@ class TorqueMirror:
 
     def __init__(
         self,
-        robots: Sequence[str],
-        torque_scale: float,
+        hosts: Sequence[Host],
         period_ns: int | Sequence[int],
         envelopes: Sequence[EnvelopePlan] = (),
-        makers: Mapping[int, Callable[[float, float], list[Frame]]] | None = None,
     ) -> None:
-        if len(robots) > MAX_ROBOTS:
-            raise ValueError(f"a bus has identifiers for {MAX_ROBOTS} robots, not {len(robots)}")
-        periods = [period_ns] * len(robots) if isinstance(period_ns, int) else list(period_ns)
-        if len(periods) != len(robots) or min(periods, default=1) <= 0:
-            raise ValueError(f"periods must be positive, one for each of {len(robots)} robots, not {period_ns!r} ns")
-        self._codec = NativeCodec(torque_scale)
-        self._names = tuple(robots)
+        periods = [period_ns] * len(hosts) if isinstance(period_ns, int) else list(period_ns)
+        if len(periods) != len(hosts) or min(periods, default=1) <= 0:
+            raise ValueError(f"periods must be positive, one for each of {len(hosts)} robots, not {period_ns!r} ns")
+        self._hosts = tuple(hosts)
         self._period_ns = periods
-        self._counters = [0] * len(robots)
         self._envelopes = [Envelope(plan) for plan in envelopes]
-        self._makers = makers or {}
-        self.counts = [RobotCounts() for _ in robots]
+        self.counts = [RobotCounts() for _ in hosts]
         self.frames = 0
 
     def encode(
@@ -115,11 +101,11 @@ class TorqueMirror:
             if reason is not None:
                 return self.stop(robot, reason)
         counts.saturated += saturated
-        if robot in self._makers:
-            return self._send_made(robot, self._makers[robot](tau_right, tau_left))
-        data, clipped = self._codec.encode(robot, tau_right, tau_left, self._counters[robot], saturated=saturated)
-        counts.clipped += clipped > 0
-        return self._send(robot, data)
+        host = self._hosts[robot]
+        clipped = host.clipped
+        frames = host.mirror(tau_right, tau_left, True, saturated)
+        counts.clipped += host.clipped > clipped
+        return self._send(robot, frames)
 
     def stop(self, robot: int, why: StrEnum = Stop.REQUESTED) -> list[Frame]:
         """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
@@ -127,25 +113,13 @@ class TorqueMirror:
         counts.stopped[why.value] = counts.stopped.get(why.value, 0) + 1
         if self._envelopes and counts.last_ns is not None:
             self._envelopes[robot].stop(counts.last_ns)
-        if robot in self._makers:
-            return self._send_made(robot, self._makers[robot](0.0, 0.0))
-        data, _ = self._codec.encode(robot, 0.0, 0.0, self._counters[robot], enable=(False, False))
-        return self._send(robot, data)
+        return self._send(robot, self._hosts[robot].mirror(0.0, 0.0, False))
 
-    def _send(self, robot: int, data: bytes) -> list[Frame]:
-        can_id = frame_id(robot)
-        self._counters[robot] += 1
-        counts = self.counts[robot]
-        counts.frames += 1
-        self.frames += 1
-        counts.bits.add(can_id, data)
-        return [(can_id, data)]
-
-    def _send_made(self, robot: int, frames: list[Frame]) -> list[Frame]:
+    def _send(self, robot: int, frames: list[Frame]) -> list[Frame]:
         counts = self.counts[robot]
         counts.frames += len(frames)
         self.frames += len(frames)
-        for can_id, data in frames:
+        for can_id, data, _ in frames:
             counts.bits.add(can_id, data)
         return frames
 

@@ -7,15 +7,8 @@ from collections import deque
 from math import inf
 from typing import Final
 
-from echelon.bridge.cia402.codec import RPDO_IDS
 from echelon.bridge.frame import WHEELS
-from echelon.bridge.native.codec import BASE_ID
-from echelon.bridge.observe import Observer
-from echelon.bridge.odrive.codec import frame_id
-from echelon.bridge.odrive.config import ODriveConfig
-from echelon.bridge.odrive.enums import Command
-from echelon.bridge.odrive.observe import ODriveObserver
-from echelon.bridge.protocols import make_observer
+from echelon.bridge.protocols import cyclic_of, make_observer, protocol_of
 from echelon.plan import Plan, RobotPlan
 
 _WINDOW_NS: Final = 250_000_000
@@ -28,10 +21,10 @@ class WheelCheck:
         self.plan = robot
         self.name = robot.name
         self.envelope = robot.envelope
-        self.observer, self.cyclic = (_closed if plan.can.closed else _mirrored)(robot)
+        self.observer = make_observer(robot, plan.can.closed)
+        self.cyclic = cyclic_of(robot, self.observer, plan.can.closed)
         drive, motor = robot.drive, robot.drive.motor
-        bits = {"native": drive.torque_scale, "cia402": max(1, round(1000 * motor.rated_torque)) * 1e-6, "odrive": 0.0}
-        self._bit = bits[drive.protocol] * 1.000001
+        self._bit = protocol_of(robot).resolution(drive) * 1.000001
         slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
         self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns) + late_ns
         self._wheels = [Commands(self._effect_ns) for _ in WHEELS]
@@ -110,25 +103,6 @@ class WheelCheck:
             if not least - room <= torque <= most + room:
                 text = f"{name}: reported {torque:g} N m, commanded were {least:g} to {most:g} N m"
                 said.append(("torque not commanded", text))
-
-
-def _closed(robot: RobotPlan) -> tuple[Observer, dict[int, int]]:
-    observer = make_observer(robot)
-    return observer, observer.cyclic
-
-
-def _mirrored(robot: RobotPlan) -> tuple[Observer, dict[int, int]]:
-    """What is to be heard where nobody answers: torques, once per acceleration period."""
-    drive = robot.drive
-    observer = make_observer(robot)
-    if drive.protocol == "odrive":
-        observer = ODriveObserver(drive, robot.envelope, robot.index, ODriveConfig(heartbeat_msg_rate_ms=0))
-        can_ids = [frame_id(node, Command.SET_INPUT_TORQUE) for node in drive.node_ids]
-    elif drive.protocol == "cia402":
-        can_ids = [RPDO_IDS[1] + node for node in drive.node_ids]
-    else:
-        can_ids = [BASE_ID + robot.index]
-    return observer, dict.fromkeys(can_ids, robot.period_ns)
 
 
 class Extremes:

@@ -11,8 +11,9 @@ from typing import Annotated, Any, Final, Protocol, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from echelon.errors import PartRunError
 from echelon.plan import Array
-from echelon.plugins import Part, PartRunError, Plugin
+from echelon.plugins import Part, Plugin
 from echelon.values import Finite, NonNegative, Point, Positive
 
 

@@ -1,13 +1,86 @@
 """echelon: groups of wheeled robots in formation, every robot its own process, wheel torques on a CAN bus.
 
-This package is the vocabulary that every process shares: the scenario and the plan made from it, messages and their
-bytes, links, roles and their mailboxes, the Zenoh session, and the command line.
+For notebooks and scripts:
+
+    import echelon
+
+    run = echelon.run("lab", {"law.lead": 0.0}, engine="inprocess")
+    run.verdict                             what it claimed, and whether that held
+    run.blocks["inter"]["norm"]             |e| of a block over time, a numpy array
+    run.figure("errors")                    a figure of the report
+
+    echelon.load("lab")                     a scenario and the plan made from it
+    echelon.open_run("runs/demo")           a run from its folder
+    echelon.Simulation("lab")               a run step by step
+
+For parts of your own: `Plant`, `Trajectory`, `DriveProtocol` (docs/add-a-law.md, docs/add-a-protocol.md).
+The command line is `echelon --help`.
 """
 
-import os
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from echelon.agents.plant import Plant
+    from echelon.bridge.protocol import DriveProtocol
+    from echelon.controller.trajectory import Trajectory
+    from echelon.errors import UserError
+    from echelon.sim.notebook import Loaded, load, open_run, run
+    from echelon.sim.results.run import Run
+    from echelon.sim.simulation import Simulation
 
 __version__ = "0.1.0"
+__all__ = [
+    "DriveProtocol",
+    "Loaded",
+    "Plant",
+    "Run",
+    "Simulation",
+    "Trajectory",
+    "UserError",
+    "__version__",
+    "load",
+    "open_run",
+    "run",
+]
 
-# A formation's matrices are small, and its processes many: threads of numpy's would only wait for each other.  It reads
-# this once, when it is loaded, so it must be said before.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+def __getattr__(name: str) -> Any:
+    """Imports what is asked for: most processes and commands need little of this package."""
+    found: dict[str, Any] = {}
+    match name:
+        case "Loaded" | "load" | "open_run" | "run":
+            from echelon.sim.notebook import Loaded, load, open_run, run
+
+            found = {"Loaded": Loaded, "load": load, "open_run": open_run, "run": run}
+        case "Run":
+            from echelon.sim.results.run import Run
+
+            found = {"Run": Run}
+        case "Simulation":
+            from echelon.sim.simulation import Simulation
+
+            found = {"Simulation": Simulation}
+        case "Plant":
+            from echelon.agents.plant import Plant
+
+            found = {"Plant": Plant}
+        case "Trajectory":
+            from echelon.controller.trajectory import Trajectory
+
+            found = {"Trajectory": Trajectory}
+        case "DriveProtocol":
+            from echelon.bridge.protocol import DriveProtocol
+
+            found = {"DriveProtocol": DriveProtocol}
+        case "UserError":
+            from echelon.errors import UserError
+
+            found = {"UserError": UserError}
+        case _:
+            raise AttributeError(f"module 'echelon' has no attribute {name!r}")
+    globals().update(found)
+    return found[name]
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -6,8 +6,9 @@ from math import prod
 
 import numpy as np
 
+from echelon.errors import Mistakes
 from echelon.plan import Array, BlockPlan, NodePlan, PlanError
-from echelon.scenario import BLOCK_NAMES, Law
+from echelon.scenario import BLOCK_NAMES, Coupling, Law
 from echelon.values import Matrix
 
 
@@ -22,22 +23,23 @@ def make_blocks(law: Law, nodes: Sequence[NodePlan]) -> tuple[BlockPlan, ...]:
         blocks.append(BlockPlan(node.path or layer, layer, node.index, offset, size, sigma, np.eye(size), np.eye(size)))
         offset += size
     blocks.append(BlockPlan("centroid", "centroid", None, offset, 2, 1.0, np.eye(2), np.eye(2)))
+    mistakes = Mistakes()
     for at, rule in enumerate(law.gains):
         key = f"law.gains.{at}"
-        names = {block.name for block in fitting(blocks, rule.block, f"{key}.block")}
-        blocks = [
-            replace(block, k1=_gain(rule.k1, f"{key}.k1", block), k2=_gain(rule.k2, f"{key}.k2", block))
-            if block.name in names
-            else block
-            for block in blocks
-        ]
+        with mistakes.noted():
+            names = {block.name for block in fitting(blocks, rule.block, f"{key}.block")}
+            blocks = [
+                replace(block, k1=_gain(rule.k1, f"{key}.k1", block), k2=_gain(rule.k2, f"{key}.k2", block))
+                if block.name in names
+                else block
+                for block in blocks
+            ]
+    mistakes.check(PlanError)
     for block in blocks:
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             scaled = block.k1 / np.square(block.sigma)
         if not np.isfinite(scaled).all():
-            raise PlanError(
-                f"law.epsilon = {law.epsilon}: the gains of {block.name} over σ² are too large to compute with"
-            )
+            raise PlanError(f"{_epsilon(law)}: the gains of {block.name} over σ² are too large to compute with")
     return tuple(blocks)
 
 
@@ -50,36 +52,49 @@ def _time_scales(law: Law, nodes: Sequence[NodePlan]) -> list[float]:
         needed, what = len(nodes), "groups and the formation"
         factors = list(range(len(nodes), 0, -1))
     if len(law.epsilon) != needed:
+        numbers = "1 number" if needed == 1 else f"{needed} numbers"
         raise PlanError(
-            f"law.epsilon = {law.epsilon}: must have {needed} numbers with time_scales = {law.time_scales!r}, "
-            f"as many as {what}"
+            f"{_epsilon(law)}: must have {numbers} with time_scales = {law.time_scales!r}, as many as {what}"
         )
     return [prod(law.epsilon[:count]) for count in factors]
+
+
+def _epsilon(law: Law) -> str:
+    """Returns how a mistake in `law.epsilon` begins: with its value, and whether anybody wrote it."""
+    default = "" if "epsilon" in law.model_fields_set else ", its default (the scenario gives none)"
+    return f"law.epsilon = {law.epsilon}{default}"
 
 
 def make_coupling(law: Law, blocks: Sequence[BlockPlan]) -> Array:
     """Returns K̄ of all blocks.  Raises PlanError."""
     size = blocks[-1].offset + blocks[-1].size
     coupling = np.zeros((size, size))
+    mistakes = Mistakes()
     for at, rule in enumerate(law.coupling):
-        key = f"law.coupling.{at}"
-        pairs = [
-            (block, onto)
-            for block in fitting(blocks, rule.block, f"{key}.block")
-            for onto in fitting(blocks, rule.onto, f"{key}.onto")
-            if block is not onto
-        ]
-        if not pairs:
-            raise PlanError(f"{key}.onto = {rule.onto!r}: a block is not coupled to itself")
-        for block, onto in pairs:
-            shape = (block.size, onto.size)
-            value: float | Array = (
-                _matrix(rule.value, shape, f"{key}.value", f"{block.name} by {onto.name}")
-                if isinstance(rule.value, list)
-                else rule.value
-            )
-            coupling[_range(block), _range(onto)] = value
+        with mistakes.noted():
+            _couple(coupling, rule, blocks, f"law.coupling.{at}")
+    mistakes.check(PlanError)
     return coupling
+
+
+def _couple(coupling: Array, rule: Coupling, blocks: Sequence[BlockPlan], key: str) -> None:
+    """Enters a rule into K̄."""
+    pairs = [
+        (block, onto)
+        for block in fitting(blocks, rule.block, f"{key}.block")
+        for onto in fitting(blocks, rule.onto, f"{key}.onto")
+        if block is not onto
+    ]
+    if not pairs:
+        raise PlanError(f"{key}.onto = {rule.onto!r}: a block is not coupled to itself")
+    for block, onto in pairs:
+        shape = (block.size, onto.size)
+        value: float | Array = (
+            _matrix(rule.value, shape, f"{key}.value", f"{block.name} by {onto.name}")
+            if isinstance(rule.value, list)
+            else rule.value
+        )
+        coupling[_range(block), _range(onto)] = value
 
 
 def fitting(blocks: Sequence[BlockPlan], name: str, key: str) -> list[BlockPlan]:

@@ -1,7 +1,9 @@
 """The part of a plan that concerns the CAN bus: motors, drives, envelopes, buses, events, and who is in between."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, ClassVar, Final, Protocol
+
+from echelon.plugins import Part
 
 NEVER_NS = 1 << 62
 """Later than any instant of a run."""
@@ -14,7 +16,7 @@ class MotorPlan:
     torque_limit: float
     """Largest shaft torque [N m]"""
     rated_torque: float
-    """Torque it can give for ever [N m]; what CiA 402 counts in thousandths of"""
+    """Torque it can give for ever [N m]"""
     torque_slew: float
     """Largest change of the setpoint [N m/s]"""
     lag: float
@@ -45,22 +47,42 @@ class MotorPlan:
     """The same wheel's friction [N m s/rad]"""
 
 
+class Addressing(Protocol):
+    """What planning asks of a drive protocol (bridge.protocol.DriveProtocol): where drives are on a bus."""
+
+    wheels: ClassVar[tuple[tuple[int, ...], ...]]
+    """The wheels (0 right, 1 left) of each drive of a robot"""
+    nodes: ClassVar[range]
+    """Node ids that a drive may have"""
+    by_number: ClassVar[bool]
+    """A robot's number is the node id of its drives, which cannot be chosen"""
+
+    def identifiers(self, node: int) -> frozenset[int]:
+        """Returns the identifiers of the frames that a node alone sends or is sent."""
+
+    def shared_identifiers(self) -> frozenset[int]:
+        """Returns the identifiers that all drives of the protocol on a bus share."""
+
+    def refuses(self, motor: MotorPlan) -> str:
+        """Returns what the protocol cannot say of a motor, beginning with the key; empty if it can say all."""
+
+
 @dataclass(frozen=True, slots=True)
 class DrivePlan:
     """The drives of a robot's wheels: their protocol, their place on the bus, their motor (both wheels have the same)."""
 
-    protocol: str
-    """`native`, `odrive` or `cia402`"""
+    protocol: Part[Any]
+    """A bridge.protocol.DriveProtocol"""
     bus: int
     """Which of the plan's buses"""
     node_ids: tuple[int, int]
-    """Of the right and the left wheel's drive; the robot's number, twice, for `native`"""
+    """Of the right and the left wheel's drive; twice the same where one drive has both wheels"""
     period_ns: int
     """Between two torque frames, and between two feedback frames"""
     watchdog_ns: int
     """A drive that hears no command for so long stops, and stays stopped"""
     torque_scale: float
-    """Of the native frame [N m per bit]"""
+    """Of frames with torques in whole numbers [N m per bit]"""
     recover_ns: int | None
     """So long after a fault the host clears it and enables the drive anew; None: never"""
     motor: MotorPlan

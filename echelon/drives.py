@@ -4,20 +4,19 @@ Raises PlanError with the key, the value and what is allowed.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from math import ceil, inf
 from typing import Any, Final
 
 from echelon.can_plan import NEVER_NS, BusPlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan, MotorPlan
 from echelon.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop, Event
+from echelon.node_ids import Place, ask, choose_nodes
 from echelon.plan import PlanError, RobotPlan
+from echelon.plugins import Part
 from echelon.values import path_matches
 
 RAW_MAX: Final = 32767
-"""Largest number of bits in a torque frame."""
-HOST_NODE: Final = 127
-"""The bridge's own node id on a CANopen bus."""
-ODRIVE_NODES: Final = 62
-"""Largest node id of an ODrive; 63 is for those without one."""
+"""Largest whole number in a frame with torques."""
 MOTOR_DEFAULTS: Final[dict[str, Any]] = {
     "torque_slew": inf,
     "lag": 0.0,
@@ -74,17 +73,20 @@ def make_can(can: Can, cycle_ns: int) -> CanPlan:
 
 
 class DriveMaker:
-    """Makes the drives of robots, one robot after the other: node ids are given out in their order."""
+    """Makes the drives of robots, one robot after the other, and when all are there, gives them their node ids.
 
-    def __init__(self, can: Can, plan: CanPlan) -> None:
-        self._can, self._plan = can, plan
-        self._next: dict[tuple[int, str], int] = {}
-        self._taken: list[dict[int, str]] = [{} for _ in plan.buses]
+    `default` is the protocol where a scenario names none."""
 
-    def drive(self, values: dict[str, Any], key: str, robot: int, path: str, period_ns: int) -> DrivePlan:
-        """Returns the drives of a robot with these (inherited) values; takes `bus` and `drive` out of them."""
-        bus, table = self._bus(values.pop("bus", None), key), DriveTable(**values.pop("drive", None) or {})
-        protocol = table.protocol or "native"
+    def __init__(self, can: Can, plan: CanPlan, default: Part[Any]) -> None:
+        self._can, self._plan, self._default = can, plan, default
+        self._places: list[Place] = []
+
+    def drive(
+        self, table: DriveTable, values: dict[str, Any], key: str, robot: int, path: str, period_ns: int
+    ) -> DrivePlan:
+        """Returns the drives of a robot with these (inherited) values, not placed yet; takes `bus` out of them."""
+        bus, protocol = self._bus(values.pop("bus", None), key), table.protocol or self._default
+        self._places.append(Place(f"{key}.drive", path, robot, bus, protocol, table.node_ids))
         given = table.model_dump(exclude_none=True, exclude={"protocol", "node_ids", "recover_after"})
         most = min(values["torque_limit"], RAW_MAX * self._can.torque_scale)
         motor = MOTOR_DEFAULTS | {"torque_limit": most, "rated_torque": most} | given
@@ -93,22 +95,24 @@ class DriveMaker:
                 f"{key}.drive.derating_from = {motor['derating_from']}: must be less than temperature_limit = "
                 f"{motor['temperature_limit']}"
             )
-        if protocol == "cia402" and not 1e-3 <= motor["rated_torque"] < 2**32 * 1e-3:
-            raise PlanError(
-                f"{key}.drive.rated_torque = {motor['rated_torque']}: CiA 402 says it in 32 bits of 0.001 N m"
-            )
-        plan = DrivePlan(
+        motor_plan = MotorPlan(**motor)
+        if text := ask(protocol, f"{key}.drive", "refuses", motor_plan):
+            raise PlanError(f"{key}.drive.{text}")
+        return DrivePlan(
             protocol=protocol,
             bus=bus,
-            node_ids=self._node_ids(table, protocol, bus, robot, f"{key}.drive"),
+            node_ids=(robot, robot),
             period_ns=period_ns,
             watchdog_ns=self._plan.watchdog_ns,
             torque_scale=self._can.torque_scale,
             recover_ns=None if table.recover_after is None else round(table.recover_after * 1e9),
-            motor=MotorPlan(**motor),
+            motor=motor_plan,
         )
-        self._take(plan, robot, path, f"{key}.drive")
-        return plan
+
+    def placed(self, robots: Sequence[RobotPlan]) -> tuple[RobotPlan, ...]:
+        """Returns all robots whose drives were made, with their node ids."""
+        nodes = choose_nodes(self._places)
+        return tuple(replace(robot, drive=replace(robot.drive, node_ids=nodes[robot.index])) for robot in robots)
 
     def envelope(self, values: dict[str, Any]) -> EnvelopePlan:
         """Returns the envelope of a robot with these (inherited) values; takes `envelope` out of them."""
@@ -128,44 +132,6 @@ class DriveMaker:
         if name not in names:
             raise PlanError(f"{key}.bus = {name!r}: must be one of {', '.join(map(repr, names))}")
         return names.index(name)
-
-    def _node_ids(self, table: DriveTable, protocol: str, bus: int, robot: int, key: str) -> tuple[int, int]:
-        if protocol == "native":
-            if table.node_ids is not None:
-                raise PlanError(f"{key}.node_ids: not for the native protocol, which goes by the robot's number")
-            return robot, robot
-        first = self._next.get((bus, protocol), 1)
-        right, left = table.node_ids or (first, first + 1)
-        least, most = (0, ODRIVE_NODES) if protocol == "odrive" else (1, HOST_NODE - 1)
-        if right == left or not (least <= right <= most and least <= left <= most):
-            what = f"{key}.node_ids = [{right}, {left}]: two different ones from {least} to {most}"
-            hint = "" if table.node_ids else "; put some robots on another bus (can.buses)"
-            raise PlanError(f"{what} are needed for {protocol}{hint}")
-        self._next[bus, protocol] = max(first, right + 1, left + 1)
-        return right, left
-
-    def _take(self, plan: DrivePlan, robot: int, path: str, key: str) -> None:
-        """Refuses drives that share identifiers with those of another robot on their bus."""
-        taken = self._taken[plan.bus]
-        own, shared = identifiers(plan, robot)
-        for can_id in own | shared:
-            other = taken.get(can_id)
-            if other is not None and not (can_id in shared and other == ""):
-                who = f"with those of {other}" if other else "with CANopen's management on the same bus"
-                raise PlanError(
-                    f"{key}: identifier {can_id:#05x} of {path} collides {who}; give other node_ids, or another bus"
-                )
-        taken.update(dict.fromkeys(own, path) | dict.fromkeys(shared, ""))
-
-
-def identifiers(drive: DrivePlan, robot: int) -> tuple[set[int], set[int]]:
-    """Returns the identifiers that a robot's drives use alone, and those they share with drives of the same protocol."""
-    if drive.protocol == "native":
-        return {0x100 + robot, 0x180 + robot, 0x200 + robot}, set()
-    if drive.protocol == "odrive":
-        return {node << 5 | command for node in drive.node_ids for command in range(32)}, set()
-    functions = (0x080, 0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500, 0x580, 0x600, 0x700)
-    return {base + node for node in drive.node_ids for base in functions}, {0x000, 0x080, 0x700 + HOST_NODE}
 
 
 def make_events(events: Iterable[Event], robots: Sequence[RobotPlan], can: CanPlan) -> tuple[EventPlan, ...]:

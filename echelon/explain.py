@@ -36,7 +36,7 @@ TEXTS: Final = {
 }
 """What is said of pydantic's types of errors; those that need more than their context are in `_text`."""
 
-NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits or underscores"
+NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits, hyphens or underscores"
 PAIR_RULE: Final = "must be two numbers, [x, y]"
 
 
@@ -70,15 +70,32 @@ class PartError(ValueError):
         return PartError(self.text, keys, shown, self.errors, self.model)
 
 
-def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[str | int, ...] = ()) -> Mistake:
-    """Returns the mistake to show first: an unknown key before the missing one that it may be meant to be.
+def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[str | int, ...] = ()) -> list[Mistake]:
+    """Returns the mistakes, each once.  Of a key that is missing and an unknown one that it is meant to be, the latter.
 
     `root` is the model that was validated, `above` are the keys that lead to it in the file."""
-    first = errors[0]
-    if first["type"] == "missing":
-        same_table = [e for e in errors if e["type"] == "extra_forbidden" and e["loc"][:-1] == first["loc"][:-1]]
-        first = same_table[0] if same_table else first
-    kind, value, location = first["type"], first["input"], first["loc"]
+    meant = {
+        (error["loc"][:-1], close)
+        for error in errors
+        if error["type"] == "extra_forbidden"
+        and (close := _close_key(str(error["loc"][-1]), _walk(error["loc"], root)[1]))
+    }
+    told = [e for e in errors if e["type"] != "missing" or (e["loc"][:-1], e["loc"][-1]) not in meant]
+    return list(dict.fromkeys(mistake for error in told for mistake in _mistakes(error, root, above)))
+
+
+def _mistakes(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int, ...]) -> list[Mistake]:
+    if error["type"] != "value_error" or not isinstance(part := error["ctx"]["error"], PartError):
+        return [_mistake(error, root, above)]
+    keys = above + _walk(error["loc"], root)[0] + part.keys
+    if part.model is not None:
+        return explain(part.errors, part.model, keys)
+    shown = "" if part.shown is None else f" = {value_text(part.shown)}"
+    return [Mistake(keys, f"{key_text(keys)}{shown}: {part.text}")]
+
+
+def _mistake(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int, ...]) -> Mistake:
+    kind, value, location = error["type"], error["input"], error["loc"]
     if kind.startswith("recursion"):
         return Mistake(("formation",), "formation: groups are nested too deep")
     if kind.startswith("string") and location[-1] == "[key]":  # not a value is wrong, but the key before it
@@ -86,8 +103,6 @@ def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[
         return Mistake(keys, f"{key_text(keys)}: {NAME_RULE}")
     keys, annotation = _walk(location, root)
     keys = above + keys
-    if kind == "value_error" and isinstance(part := first["ctx"]["error"], PartError):
-        return _of_part(part, keys)
     if kind == "extra_forbidden":
         return Mistake(keys, f"{key_text(keys)}: {_unknown(str(keys[-1]), annotation)}")
     if kind in ("union_tag_invalid", "union_tag_not_found"):  # of a table that says its `kind`
@@ -97,17 +112,9 @@ def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[
         return Mistake(keys, f"{key_text(keys)} = {value_text(value['kind'])}: {_one_of(kinds, value['kind'])}")
     if kind == "missing" and isinstance(keys[-1], int):  # half of a pair: the pair is what is wrong
         keys, kind = keys[:-1], "tuple_type"
-    text = PAIR_RULE if kind == "tuple_type" else _text(first, annotation)
+    text = PAIR_RULE if kind == "tuple_type" else _text(error, annotation)
     shown = "" if kind in ("missing", "value_error") else f" = {value_text(value)}"
     return Mistake(keys, f"{key_text(keys)}{shown}: {text}")
-
-
-def _of_part(mistake: PartError, keys: tuple[str | int, ...]) -> Mistake:
-    keys += mistake.keys
-    if mistake.model is not None:
-        return explain(mistake.errors, mistake.model, keys)
-    shown = "" if mistake.shown is None else f" = {value_text(mistake.shown)}"
-    return Mistake(keys, f"{key_text(keys)}{shown}: {mistake.text}")
 
 
 def _text(error: ErrorDetails, annotation: Any) -> str:
@@ -142,11 +149,17 @@ def _one_of(allowed: Sequence[str], value: Any = None) -> str:
 
 
 def _unknown(key: str, model: Any) -> str:
-    known = sorted(_bare(model).model_fields)
-    close = get_close_matches(key, known, n=1, cutoff=0.5)
+    close = _close_key(key, model)
+    known = ", ".join(sorted(_bare(model).model_fields))
     if not known:
         return "unknown key; there are none here"
-    return f"unknown key; did you mean {close[0]!r}?" if close else f"unknown key; known here: {', '.join(known)}"
+    return f"unknown key; did you mean {close!r}?" if close else f"unknown key; known here: {known}"
+
+
+def _close_key(key: str, model: Any) -> str | None:
+    """Returns the key of a table that an unknown one is probably meant to be."""
+    close = get_close_matches(key, sorted(_bare(model).model_fields), n=1, cutoff=0.5)
+    return close[0] if close else None
 
 
 def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ...], Any]:
@@ -171,6 +184,22 @@ def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ..
         else:  # a list, a pair, or a table of tables: what it holds comes last
             annotation = get_args(bare)[-1]
     return tuple(keys), annotation
+
+
+def is_array(keys: Sequence[str], root: type[BaseModel]) -> bool:
+    """True if an array of tables stands at a path of keys of a model, numbers of entries among them."""
+    annotation: Any = root
+    for key in keys:
+        bare = _bare(annotation)
+        if _is_model(bare) and key in bare.model_fields:
+            annotation = bare.model_fields[key].annotation
+        elif get_origin(bare) in (list, dict):
+            annotation = get_args(bare)[-1]
+        else:
+            return False
+    bare = _bare(annotation)
+    entry = get_args(bare)[0] if get_origin(bare) is list else None
+    return _is_model(entry) or any(map(_is_model, _members(entry).values()))
 
 
 def _is_model(annotation: Any) -> bool:
@@ -227,8 +256,3 @@ def value_text(value: Any) -> str:
 def short(text: str) -> str:
     """Returns a text on at most 60 characters."""
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def one_line(text: str) -> str:
-    """Returns a text with everything that is not printable escaped: one line, whatever was in the file."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

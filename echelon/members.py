@@ -8,7 +8,9 @@ from typing import Any, Final, TypeVar
 
 from echelon import shapes
 from echelon.can_plan import CanPlan
+from echelon.can_tables import DriveTable
 from echelon.drives import DriveMaker, make_can
+from echelon.errors import Mistakes
 from echelon.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.plugins import Part, Registry
 from echelon.scenario import Group, RobotTable, Scenario, Shape
@@ -24,7 +26,7 @@ DEFAULT_PLANT: Final = "paper"
 NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
 """What must be said of every robot, on some level."""
 MAX_ROBOTS: Final = 127
-"""As many as the native torque frame has identifiers for."""
+"""As many as a bus has identifiers for where each robot has three of its own."""
 MAX_NS: Final = 2**62
 """146 years: sums of two instants still fit the message header."""
 
@@ -48,12 +50,13 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
         acceleration_ns=nanoseconds(scenario.periods.acceleration, "periods.acceleration"),
         torque_ns=torque_ns,
         first_node=count,
-        drives=DriveMaker(scenario.can, can),
+        drives=DriveMaker(scenario.can, can, registry.default("protocols")),
         closed=can.closed,
         default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
-    return tuple(walk.robots), tuple(walk.nodes), can
+    walk.check()
+    return walk.drives.placed(walk.robots), tuple(walk.nodes), can
 
 
 def robot_key(path: str) -> str:
@@ -82,7 +85,9 @@ class _Place:
 
 
 class _Walk:
-    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them."""
+    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them.
+
+    Mistakes are noted on the way; what was made is worth nothing until `check` has said that there are none."""
 
     def __init__(
         self,
@@ -94,56 +99,79 @@ class _Walk:
         default_plant: Part[Any],
     ) -> None:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
-        self._drives, self._closed, self._default_plant = drives, closed, default_plant
+        self.drives, self._closed, self._default_plant = drives, closed, default_plant
+        self._mistakes = Mistakes()
+        self._of_robots: dict[str, list[str]] = {}  # what is wrong, behind the robot's key: the keys of those robots
         self.robots: list[RobotPlan] = []
         self.nodes: list[NodePlan] = []
+
+    def check(self) -> None:
+        """Raises PlanError if there were mistakes.  What many robots inherit is told of the first one."""
+        for text, keys in self._of_robots.items():
+            same = f"; the same holds for {len(keys) - 1} more" if len(keys) > 1 else ""
+            self._mistakes.lines.append(f"{keys[0]}{text}{same}")
+        self._mistakes.check(PlanError)
 
     def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
         """Adds a group and all below it; returns its node."""
         index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
         first_robot = len(self.robots)
         inherited = _overlaid(inherited, group.robot)
-        period_ns, period_key = self._acceleration_ns, "periods.acceleration"
-        if group.period is not None:
-            period_key = f"{place.key}.period"
-            period_ns = nanoseconds(group.period, period_key)
-        if period_ns % self._torque_ns:
-            raise PlanError(f"periods.torque = {self._torque_ns / 1e9}: must divide {period_key} = {period_ns / 1e9}")
+        period_key = "periods.acceleration" if group.period is None else f"{place.key}.period"
+        period_ns = self._acceleration_ns if group.period is None else 0
+        with self._mistakes.noted():
+            if group.period is not None:
+                period_ns = nanoseconds(group.period, period_key)
+            if period_ns % self._torque_ns:
+                raise PlanError(
+                    f"periods.torque = {self._torque_ns / 1e9}: must divide {period_key} = {period_ns / 1e9}"
+                )
         below = _Place(place.key, f"{place.path}/" if place.path else "", index, 0, place.depth + 1)
-        children: list[RobotPlan | NodePlan] = []
+        children: list[int] = []
+        weights: list[int] = []
         for name, table in group.robots.items():
             at = replace(below, key=f"{place.key}.robots.{name}", path=below.path + name, child_number=len(children))
-            self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
-            children.append(self.robots[-1])
+            children.append(len(self.robots))
+            weights.append(1)
+            try:
+                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
+            except PlanError as error:
+                for line in error.lines:
+                    self._of_robots.setdefault(line.removeprefix(at.key), []).append(at.key)
         for name, sub in group.groups.items():
             at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
             child = self.add_group(sub, at, inherited)
-            if period_ns % child.period_ns:
-                raise PlanError(
-                    f"{period_key} = {period_ns / 1e9}: must be a multiple of {child.period_ns / 1e9}, "
-                    f"the period of {child.name}"
-                )
-            children.append(child)
+            children.append(child.index)
+            weights.append(child.robots)
+            with self._mistakes.noted():
+                if child.period_ns and period_ns % child.period_ns:
+                    raise PlanError(
+                        f"{period_key} = {period_ns / 1e9}: must be a multiple of {child.period_ns / 1e9}, "
+                        f"the period of {child.name}"
+                    )
+        shape = ShapePlan("points", ())
+        with self._mistakes.noted():
+            shape = _shape(group.shape, len(children), f"{place.key}.shape")
         node = NodePlan(
             index=index,
             path=place.path,
             parent=place.parent,
             child_number=place.child_number,
-            children=tuple(child.index for child in children),
-            weights=tuple(child.robots if isinstance(child, NodePlan) else 1 for child in children),
+            children=tuple(children),
+            weights=tuple(weights),
             first_robot=first_robot,
             depth=place.depth,
             period_ns=period_ns,
-            shape=_shape(group.shape, len(children), f"{place.key}.shape"),
+            shape=shape,
         )
         self.nodes.append(node)
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model"})
-        for needed in NEEDED:
-            if needed not in values:
-                raise PlanError(f"{place.key}.{needed}: missing (neither here, nor in its group, nor in [robot])")
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
+        if lacking := [needed for needed in NEEDED if needed not in values]:
+            nowhere = "missing (neither here, nor in its group, nor in [robot])"
+            raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
         if values["offset"] == 0:
             raise PlanError(f"{place.key}.offset = 0: must not be zero, or the wheels cannot steer the reference point")
         least = values["mass"] * values["offset"] * values["offset"]
@@ -156,8 +184,8 @@ class _Walk:
         cycle_ns = self._torque_ns if self._closed else period_ns
         return RobotPlan(
             index=index,
-            envelope=self._drives.envelope(values),
-            drive=self._drives.drive(values, place.key, index, place.path, cycle_ns),
+            envelope=self.drives.envelope(values),
+            drive=self.drives.drive(table.drive or DriveTable(), values, place.key, index, place.path, cycle_ns),
             path=place.path,
             parent=place.parent,
             child_number=place.child_number,

@@ -5,6 +5,7 @@
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
     law = { use = "my_laws.py:Relay", parameters = { gain = 2.0 }, epsilon = [0.5] }   beside keys of the table itself
+    robot.drive.protocol = "odrive"
 
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
@@ -21,12 +22,10 @@ from echelon.plugins import Part, Registry, Source
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
 _NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.load)"
-_SCHEMA: Final[dict[str, Any]] = {
-    "type": "object",
-    "properties": {"use": {"type": "string"}, _PARAMETERS: {"type": "object"}},
-    "required": ["use"],
-    "additionalProperties": False,
-}
+PART: Final = "part"
+"""Stands in the JSON schema of a field of this kind, with the group of its parts: echelon.schema says what may be written"""
+BESIDE: Final = "beside"
+"""Stands there too; True: parameters are written beside the part's name; None: in a key of their own"""
 
 
 class PartContext(NamedTuple):
@@ -174,15 +173,25 @@ def _beside_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None
 
 
 TrajectoryField = Annotated[
-    Part[Any], PlainValidator(_inline("trajectories")), PlainSerializer(_written_inline), WithJsonSchema(_SCHEMA)
+    Part[Any],
+    PlainValidator(_inline("trajectories")),
+    PlainSerializer(_written_inline),
+    WithJsonSchema({PART: "trajectories", BESIDE: True}),
 ]
 PlantField = Annotated[
     Part[Any] | None,
     PlainValidator(_by_name("plants")),
     PlainSerializer(_written_by_name),
-    WithJsonSchema({"anyOf": [{"type": "string"}, _SCHEMA]}),
+    WithJsonSchema({PART: "plants", BESIDE: False}),
 ]
-LawName = Annotated[str, PlainValidator(_named("laws")), WithJsonSchema({"type": "string"})]
+ProtocolField = Annotated[
+    Part[Any] | None,
+    PlainValidator(_by_name("protocols")),
+    PlainSerializer(_written_by_name),
+    WithJsonSchema({PART: "protocols", BESIDE: False}),
+]
+WrittenLawName = Annotated[str, WithJsonSchema({PART: "laws", BESIDE: None})]
+LawName = Annotated[WrittenLawName, PlainValidator(_named("laws"))]
 LawParameters = Annotated[
     Part[Any],
     PlainValidator(_beside_name("laws")),

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.can_plan import DISTURBANCES, NEVER_NS, BusRolePlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan
+from echelon.errors import UserError
 from echelon.messages import Channel
 from echelon.plugins import Part
 
@@ -20,8 +21,8 @@ Array = NDArray[np.float64]
 COORDINATOR = "coordinator"
 
 
-class PlanError(Exception):
-    """A scenario whose values do not fit together; the text begins with the key."""
+class PlanError(UserError):
+    """A scenario whose values do not fit together; each line begins with the key."""
 
 
 @dataclass(frozen=True, slots=True)

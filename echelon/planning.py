@@ -1,8 +1,8 @@
 """From a scenario to a plan: the tree's members, the law's blocks, links, and whether all of it fits together.
 
 What a single table cannot see is checked on the way: periods that divide each other, shapes of the right size, gains of
-the right shape, rules that fit nothing, robots that start in each other's place.  Raises PlanError with the key, the
-value and what is allowed.
+the right shape, rules that fit nothing, robots that start in each other's place.  Raises PlanError with a line for each
+mistake: the key, the value and what is allowed.
 """
 
 from collections.abc import Sequence
@@ -10,15 +10,19 @@ from itertools import combinations
 from math import dist
 from typing import Final
 
+import numpy as np
+
 from echelon.blocks import fitting, make_blocks, make_coupling
-from echelon.can_plan import NEVER_NS, BusRolePlan, CanPlan
+from echelon.can_plan import NEVER_NS, BusRolePlan, CanPlan, EventPlan
 from echelon.drives import make_events
+from echelon.errors import Mistakes
 from echelon.layout import sized
 from echelon.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
 from echelon.messages import Channel
 from echelon.plan import (
     COORDINATOR,
     AvoidancePlan,
+    BlockPlan,
     ClaimPlan,
     LinkPlan,
     NodePlan,
@@ -37,19 +41,38 @@ SHOWN_NAMES: Final = 12
 
 
 def make_plan(scenario: Scenario, registry: Registry) -> Plan:
-    """Returns the plan of a scenario; parts that it does not name come from `registry`.  Raises PlanError."""
+    """Returns the plan of a scenario; parts that it does not name come from `registry`.
+
+    Raises PlanError with all mistakes that do not hide each other."""
     robots, nodes, can = make_members(scenario, registry)
-    bus_roles = _bus_roles(robots, nodes, can)
-    _check_starts(robots, scenario.avoidance.avoidance_radius if scenario.avoidance.enabled else 0.0)
-    duration_ns = nanoseconds(scenario.duration, "duration")
-    if duration_ns % nodes[-1].period_ns:
-        period = nodes[-1].period_ns / 1e9
-        raise PlanError(f"duration = {scenario.duration}: must be a multiple of {period}, the coordinator's period")
-    display_ns = nanoseconds(scenario.record.display_period, "record.display_period")
-    blocks = make_blocks(scenario.law, nodes)
-    _check_law(scenario.law)
-    for at, claim in enumerate(scenario.claims):
-        fitting(blocks, claim.block, f"claims.{at}.block")
+    mistakes = Mistakes()
+    bus_roles: tuple[BusRolePlan, ...] = ()
+    links: tuple[LinkPlan, ...] = ()
+    blocks: tuple[BlockPlan, ...] = ()
+    events: tuple[EventPlan, ...] = ()
+    coupling = np.zeros((0, 0))
+    duration_ns = display_ns = 0
+    with mistakes.noted():
+        bus_roles = _bus_roles(robots, nodes, can)
+    with mistakes.noted():
+        _check_starts(robots, scenario.avoidance.avoidance_radius if scenario.avoidance.enabled else 0.0)
+    with mistakes.noted():
+        duration_ns = _duration_ns(scenario, nodes[-1])
+    with mistakes.noted():
+        display_ns = nanoseconds(scenario.record.display_period, "record.display_period")
+    with mistakes.noted():
+        blocks = make_blocks(scenario.law, nodes)
+        for at, claim in enumerate(scenario.claims):
+            with mistakes.noted():
+                fitting(blocks, claim.block, f"claims.{at}.block")
+        coupling = make_coupling(scenario.law, blocks)
+    with mistakes.noted():
+        _check_law(scenario.law)
+    with mistakes.noted():
+        links = _links(scenario.links, robots, nodes, bus_roles, can)
+    with mistakes.noted():
+        events = make_events(scenario.events, robots, can)
+    mistakes.check(PlanError)
     plan = Plan(
         name=scenario.name,
         seed=scenario.seed,
@@ -59,14 +82,14 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         nodes=nodes,
         blocks=blocks,
         law=scenario.law.parameters,
-        coupling=make_coupling(scenario.law, blocks),
+        coupling=coupling,
         lead=scenario.law.lead,
         trajectory=scenario.trajectory,
         avoidance=AvoidancePlan(**scenario.avoidance.model_dump()),
-        links=_links(scenario.links, robots, nodes, bus_roles, can),
+        links=links,
         can=can,
         claims=tuple(ClaimPlan(claim.block, claim.settled_by, claim.band) for claim in scenario.claims),
-        events=make_events(scenario.events, robots, can),
+        events=events,
         bus_roles=bus_roles,
     )
     return sized(plan)
@@ -78,6 +101,14 @@ def _check_law(law: Law) -> None:
         if value != unset and key not in law.parameters.made.uses:
             what = "has gains of its own, in law.parameters" if key == "gains" else "does not look ahead"
             raise PlanError(f"law.{key}: the law {law.use!r} {what}; leave {key} out")
+
+
+def _duration_ns(scenario: Scenario, root: NodePlan) -> int:
+    duration_ns = nanoseconds(scenario.duration, "duration")
+    if duration_ns % root.period_ns:
+        period = root.period_ns / 1e9
+        raise PlanError(f"duration = {scenario.duration}: must be a multiple of {period}, the coordinator's period")
+    return duration_ns
 
 
 def _bus_roles(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[BusRolePlan, ...]:
@@ -93,16 +124,20 @@ def _bus_roles(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanP
 
 def _check_starts(robots: Sequence[RobotPlan], radius: float) -> None:
     """Refuses robots that start in one place, or, where they avoid each other, within the radius they must keep."""
+    mistakes: dict[str, str] = {}
     for one, other in combinations(robots, 2):
         distance = dist(one.start, other.start)
         if distance == 0 or distance <= radius:
             key = f"{robot_key(other.path)}.start = {list(other.start)}"
-            if distance == 0:
-                raise PlanError(f"{key}: is where {one.name!r} starts")
-            raise PlanError(
-                f"{key}: {distance:.6g} m from {one.name}, must be more than avoidance.avoidance_radius = {radius} "
-                "where robots avoid each other"
-            )
+            why = f"is where {one.name!r} starts"
+            if distance > 0:
+                why = (
+                    f"{distance:.6g} m from {one.name}, must be more than avoidance.avoidance_radius = {radius} "
+                    "where robots avoid each other"
+                )
+            mistakes.setdefault(key, f"{key}: {why}")
+    if mistakes:
+        raise PlanError(*mistakes.values())
 
 
 def _links(
@@ -134,9 +169,9 @@ def _links(
             wanted = can.watchdog_ns if rule.timeout is None else round(rule.timeout * 1e9)
             timeout_ns = max(wanted, 2 * period_ns) if rule.timeout is None else wanted
         links.append(LinkPlan(source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, timeout_ns))
-    for at, rule in enumerate(rules):
-        if at not in used:
-            raise PlanError(_why_unused(rule, f"links.{at}", names, can.closed))
+    unused = [_why_unused(rule, f"links.{at}", names, can.closed) for at, rule in enumerate(rules) if at not in used]
+    if unused:
+        raise PlanError(*unused)
     return (*links, *_shaft_links(robots, bus_roles, can))
 
 

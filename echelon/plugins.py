@@ -23,7 +23,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from echelon.explain import PartError, one_line
+from echelon.explain import PartError
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -35,13 +35,6 @@ class Plugin(BaseModel):
     """Base of every part: a frozen pydantic model whose fields are its parameters; unknown keys are mistakes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PartRunError(Exception):
-    """A part that others wrote failed in a run; the text is one line that names its file and class, and what it did."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(one_line(text))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +86,8 @@ class Group:
     name: str
     base: type[Plugin]
     built_in: Mapping[str, type[Plugin]]
+    default: str = ""
+    """Which of those a scenario has that names none; empty: it must name one"""
 
     def find(self, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
         """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
@@ -149,6 +144,10 @@ class Registry:
     def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
         """Returns a part of a group with its parameters checked.  Raises PartError."""
         return self.groups[group].make(use, parameters, folder)
+
+    def default(self, group: str) -> Part[Any]:
+        """Returns the part of a group that a scenario has which names none."""
+        return self.make(group, self.groups[group].default, {}, Path())
 
     def allowed(self, group: str) -> str:
         """Returns what a scenario may write for a part of a group."""

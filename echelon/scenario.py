@@ -1,7 +1,7 @@
 """The scenario: what a user writes, as pydantic models.  Every key is known, every value has a range and SI units.
 
 A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
-then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.load`; the plan that roles work with
+then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.loading`; the plan that roles work with
 is made in `echelon.planning`; what concerns the CAN bus stands in `echelon.can_tables`.
 """
 
@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
 from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
-from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField, written_use
+from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField, WrittenLawName, written_use
 from echelon.values import (
     CouplingGain,
     Finite,
@@ -24,6 +24,7 @@ from echelon.values import (
     Positive,
     Seconds,
     Table,
+    alike,
 )
 from echelon.values import number_or_table as _number_or_table
 
@@ -37,57 +38,69 @@ RESERVED_NAMES = ("coordinator", "bridge", "drives", "recorder", "referee")
 
 
 class Periods(Table):
-    """How often things happen [s]."""
+    """How often things happen."""
 
     acceleration: Positive = 0.01
-    """Accelerations: every node and robot, unless a group sets a `period` of its own."""
+    """Between two accelerations of every node and robot [s], unless a group has a `period` of its own"""
     torque: Positive = 0.01
-    """The torque loop inside the robot; divides `acceleration`."""
+    """Between two torques of a robot [s]; divides `acceleration`"""
 
 
 class RobotTable(Table):
-    """A robot, or what all robots of a level have in common (theory.md section 1)."""
+    """A robot, or what all robots of a level have in common.
+
+    Each key is taken from the robot itself, else from its group's `robot`, else from the groups around it, else from
+    `[robot]`."""
 
     model: PlantField = None
-    """Plant: `paper` (the paper's equations), `rigid_body` (its mass at the reference point), or another (echelon.plugins)"""
+    """Plant: `paper` (the paper's equations, the default), `rigid_body` (its mass at the reference point), `hill` (with a load,
+    on a slope), or your own"""
     mass: Positive | None = None
-    """m1 [kg]"""
+    """m1 [kg]; must be given on some level"""
     inertia: Positive | None = None
-    """I [kg m²]; I − m1 d² must be positive"""
+    """I [kg m²], larger than mass·offset²; must be given on some level"""
     wheel_radius: Positive | None = None
-    """r [m]"""
+    """r [m]; must be given on some level"""
     arm: Positive | None = None
-    """R, lever arm of a wheel about the robot's middle: half the track [m]"""
+    """R, lever arm of a wheel about the robot's middle: half the track [m]; must be given on some level"""
     offset: Finite | None = None
-    """d, from the axle to the reference point [m]; not zero"""
+    """d, from the axle to the reference point [m]; not zero, and must be given on some level"""
     start: Point | None = None
-    """Position of the reference point at the start [m]; the robot is at rest"""
+    """Position of the reference point at the start [m]; must be given.  The robot is at rest"""
     heading: Finite | None = None
-    """θ at the start [rad]"""
+    """θ at the start, counter-clockwise from the x axis, in radians [rad]; 0 unless given"""
     torque_limit: Limit | None = None
-    """Largest torque of a wheel [N m]"""
+    """Largest torque of a wheel [N m]; none unless given"""
     torque_rate_limit: Limit | None = None
-    """Largest change of a wheel's torque [N m/s]"""
+    """Largest change of a wheel's torque [N m/s]; none unless given"""
     wheel_speed_limit: Limit | None = None
-    """Wheel speed beyond which the motor gives no torque in the direction of motion [rad/s]"""
+    """Wheel speed beyond which the motor gives no torque in the direction of motion [rad/s]; none unless given"""
     bus: Name | None = None
     """Which of `can.buses` its drives are on; the first one unless given"""
     drive: DriveTable | None = None
+    """The drives of its wheels"""
     envelope: EnvelopeTable | None = None
+    """What the bridge lets pass to its drives"""
 
 
 class Shape(Table):
-    """Desired shape of a node's children: a named one, their `points`, or the shape variables as `vectors` [m]."""
+    """Desired shape of a group: where its robots, or the centroids of its groups, are to be about each other."""
 
     kind: Literal["triangle", "polygon", "line", "column", "wedge", "points", "vectors"]
+    """`triangle` and `polygon` need `side`; `line` (side by side for travel along x), `column` (one behind the other) and
+    `wedge` (a V open to the rear) need `spacing`; or the `points` themselves, or the shape variables as `vectors`"""
     side: Positive | None = None
+    """Between neighbours of a triangle or polygon [m]"""
     spacing: Positive | None = None
+    """Between neighbours of a line, column or wedge [m]"""
     angle: Annotated[float, Field(strict=True, gt=0, lt=180)] = 90.0
-    """Between the arms of a wedge [degrees]"""
+    """Between the arms of a wedge, in degrees [°]"""
     rotation: Finite = 0.0
-    """Counter-clockwise [degrees]"""
+    """Turns the shape counter-clockwise, in degrees [°]"""
     points: list[Point] | None = None
+    """One for each child, in their order [m]; only where they are to each other matters"""
     vectors: list[Point] | None = None
+    """The shape variables, one fewer than there are children [m]"""
 
     @model_validator(mode="after")
     def _complete(self) -> "Shape":
@@ -105,13 +118,15 @@ class Group(Table):
     """A node of the tree: its children are robots, groups, or both; their order is that of the file."""
 
     shape: Shape | None = None
-    """May be left out for a single child"""
+    """Desired shape of its children; may be left out for a single child"""
     robot: RobotTable = RobotTable()
-    """What its robots have in common"""
+    """What the robots below it have in common"""
     robots: dict[Name, RobotTable] = {}
+    """Its robots by name"""
     groups: dict[Name, "Group"] = {}
+    """The groups below it by name"""
     period: Positive | None = None
-    """Period of this node's accelerations [s], if not `periods.acceleration`; a multiple of its children's"""
+    """Between two accelerations of this node [s]; `periods.acceleration` unless given; a multiple of its children's"""
 
     @model_validator(mode="after")
     def _children(self) -> "Group":
@@ -119,6 +134,8 @@ class Group(Table):
             raise ValueError("a group needs robots or groups")
         if twice := sorted(self.robots.keys() & self.groups.keys()):
             raise ValueError(f"{twice[0]!r} names a robot and a group")
+        if (name := alike([*self.robots, *self.groups])) is not None:
+            raise ValueError(f"{name!r} must differ from other names by more than hyphens and underscores")
         if reserved := sorted((self.robots.keys() | self.groups.keys()) & set(RESERVED_NAMES)):
             raise ValueError(f"{reserved[0]!r} is the name of a process that every run has")
         if taken := sorted(self.groups.keys() & set(BLOCK_NAMES)):
@@ -134,50 +151,55 @@ class Gains(Table):
     block: str = "*"
     """Which blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
     k1: Gain = 1.0
+    """Of the error"""
     k2: Gain = 1.0
+    """Of the error's rate"""
 
 
 class Coupling(Table):
     """Velocity coupling K̄ of one pair of blocks: a number for every entry, or the full matrix."""
 
     block: str = "*"
+    """Which blocks are acted on: a name, a layer, or `*`"""
     onto: str = "*"
-    """The block whose error rate acts on `block`"""
+    """The blocks whose error rates act on them"""
     value: CouplingGain
+    """A number for every entry, or the full matrix"""
 
 
 class Law(Table):
-    """The control law (theory.md section 3)."""
+    """The control law: time scales, gains and coupling of the blocks (the groups' shapes, the formation's, the centroid)."""
 
     use: LawName = Field(default="linear", validate_default=True)
-    """`linear`, `integral`, `terminal_sliding` (controller.laws), or another (docs/add-a-law.md)"""
+    """`linear` (the paper's), `integral`, `terminal_sliding`, or a law of your own (docs/add-a-law.md)"""
     parameters: LawParameters = Field(default_factory=dict, validate_default=True)
-    """Those of the law that `use` names; validated, they are the law itself, a Part"""
+    """Of the law that `use` names"""  # validated, they are the law itself, a Part
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
     epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
-    """ε1, ε2, …: each block's σ is a product of the first ones"""
+    """ε1, ε2, …: each block's σ is a product of the first ones; as many as the tree has layers, or with `multi` groups
+    and the formation"""
     gains: list[Gains] = []
-    """K_1 and K_2 of each block, for laws that use them; later entries override earlier ones"""
+    """K_1 and K_2 of blocks, for laws that use them; later entries override earlier ones"""
     coupling: list[Coupling] = []
-    """Later entries override earlier ones; none means no coupling"""
+    """Coupling of blocks; later entries override earlier ones, and without any there is none"""
     lead: Fraction = 0.0
     """How far ahead the law looks, in periods, for laws that do: 0 is the law as it stands, 0.5 makes up for the hold"""
 
     @field_serializer("use")
-    def _use(self, use: str, info: SerializationInfo) -> str:
+    def _use(self, use: str, info: SerializationInfo) -> WrittenLawName:
         return written_use(self.parameters, info)
 
 
 class Avoidance(Table):
-    """Collision avoidance (theory.md section 4)."""
+    """Collision avoidance: a potential pushes robots apart that are closer than `sensing_radius`."""
 
     enabled: Flag = False
     """False: robots do not avoid each other, but distances below `avoidance_radius` are still violations"""
     avoidance_radius: Positive = 0.25
-    """r_a [m]"""
+    """r_a: closer than this, two robots are a violation [m]"""
     sensing_radius: Positive = 1.0
-    """R_s [m]"""
+    """R_s: closer than this, two robots push each other apart [m]"""
     force_limit: Positive = 1e4
     """Cap of one pair's ∇f [m/s²], also inside r_a, where the potential is not defined"""
 
@@ -191,10 +213,12 @@ class Avoidance(Table):
 
 
 class Uniform(Table):
-    """Any delay between two bounds [s], equally likely."""
+    """Any delay between two bounds, all equally likely."""
 
     min: NonNegative
+    """[s]"""
     max: NonNegative
+    """[s]"""
 
     @model_validator(mode="after")
     def _bounds(self) -> "Uniform":
@@ -209,21 +233,25 @@ Delay = Annotated[
 
 
 class LinkRule(Table):
-    """What links are like.  `source` and `receiver` are paths in the tree or `coordinator`; `*` stands for one chunk of
-    a path, `**` for any.  The last rule that fits a link holds, and only that one."""
+    """What links are like.  The last rule that fits a link holds, and only that one."""
 
     source: str = "**"
+    """Who sends: a path in the tree (`g1/r2`) or `coordinator`; `*` stands for one chunk of a path, `**` for any number"""
     receiver: str = "**"
+    """Who receives, in the same way"""
     channel: ChannelName = "*"
+    """What is sent; `*` stands for all"""
     delay: Delay = 0.0
-    """[s]"""
+    """How long a message takes [s]: a number, or a table of two bounds.  It is used at the first tick at
+    which it has come"""
     loss: Fraction = 0.0
     """Probability that a message is lost, independent of all others"""
     policy: Literal["hold", "hold_then_stop"] | None = None
-    """What a receiver uses if nothing newer has come: the last that came, for ever or until it is older than `timeout`.
-    Unless given: `hold` where torque is mirrored, `hold_then_stop` where the torque path is closed"""
+    """What a receiver uses if nothing newer has come: the last message that came, for ever (`hold`) or until it is older
+    than `timeout` (`hold_then_stop`).  Unless given: `hold` where torque is mirrored, `hold_then_stop` where the torque
+    path is closed"""
     timeout: Seconds | None = None
-    """For `hold_then_stop` [s]; `can.watchdog` unless given"""
+    """Age from which on a message is not used any more, for `hold_then_stop` [s]; `can.watchdog` unless given"""
 
 
 class Record(Table):
@@ -231,39 +259,51 @@ class Record(Table):
 
     display_period: Positive = 0.02
     """Between transforms, markers, odometry and joint states [s of run time], at least the period of accelerations;
-    states themselves are all recorded"""
+    of states all are recorded"""
 
 
 class Claim(Table):
     """What the run is expected to show; the verdict fails if it does not."""
 
     block: str
+    """Which blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
     settled_by: Positive
-    """[s]"""
+    """When its error is to be settled [s of run time]"""
     band: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.05
     """Settled means: stays within this fraction of the block's largest error"""
 
 
 class Scenario(Table):
-    """A whole scenario."""
+    """A whole scenario: one TOML file.  Numbers are in SI units; of angles, `heading`, `phase` and `rate` are in radians,
+    `rotation` and `angle` in degrees."""
 
     name: Name
+    """What it is called; runs are called after it"""
     description: str = ""
+    """What it shows, for people"""
     duration: Positive
-    """[s of run time]"""
+    """How long it runs [s of run time]; a multiple of the coordinator's period"""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = 1
+    """Of everything random: delays, losses, error frames"""
     periods: Periods = Periods()
+    """How often things happen"""
     robot: RobotTable = RobotTable()
     """What all robots have in common"""
     formation: Group
     """The root of the tree"""
     trajectory: TrajectoryField
-    """Of the centroid: `line`, `circle`, `sine` or `waypoints` with their parameters (controller.trajectory), or another"""
+    """Where the centroid of all robots is to be: `line`, `circle`, `sine`, `waypoints`, or a trajectory of your own"""
     law: Law = Field(default_factory=dict, validate_default=True)
+    """The control law"""
     avoidance: Avoidance = Avoidance()
+    """Collision avoidance"""
     links: list[LinkRule] = []
+    """Delay and loss between robots, leaders and coordinator; without any, messages are there in the tick they are sent in"""
     can: Can = Can()
+    """The CAN bus, or buses"""
     record: Record = Record()
+    """The recording"""
     claims: list[Claim] = []
+    """What the run is expected to show"""
     events: list[Event] = []
     """What happens on schedule, in run time"""

@@ -1,5 +1,6 @@
 """Kinds of values in a scenario, as pydantic checks them, and the table that holds them."""
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
@@ -18,7 +19,8 @@ Limit = Annotated[float, Field(strict=True, gt=0)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Flag = Annotated[bool, Field(strict=True)]
 Point = tuple[Finite, Finite]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+"""Of a scenario, robot, group or bus.  Where hyphens are not allowed (ROS topics, DBC identifiers) they become underscores"""
 NodeId = Annotated[int, Field(strict=True, ge=0, le=127)]
 Bitrate = Annotated[int, Field(strict=True, ge=10_000, le=1_000_000)]
 Matrix = list[list[Finite]]
@@ -39,6 +41,13 @@ Gain = Annotated[
 CouplingGain = Annotated[
     Annotated[Finite, Tag("a number")] | Annotated[Matrix, Tag("an array")], Discriminator(number_or_array)
 ]
+
+
+def alike(names: Iterable[str]) -> str | None:
+    """Returns the name that differs from an earlier one by hyphens and underscores alone, or None: topics and DBC
+    identifiers could not tell the two apart."""
+    known: dict[str, str] = {}
+    return next((name for name in names if known.setdefault(name.replace("-", "_"), name) != name), None)
 
 
 def path_matches(pattern: str, path: str) -> bool:

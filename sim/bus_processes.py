@@ -26,13 +26,14 @@ from echelon.bridge.stations.rail import BusError
 from echelon.bridge.stations.waiting import PROGRESS_NS, Mail, RunClock, drained, wait_for
 from echelon.bridge.stations.wall_bridge import WallBridge
 from echelon.bridge.stations.wall_drives import WallDrives
+from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.role import Role
 from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.contract import Body, ProcessSpec, StartError, finish, hear_finish, meet
-from echelon.sim.to_supervisor import Failed, Report, Said, Waiting
+from echelon.sim.to_supervisor import Failed, PartFailed, Report, Said, Waiting
 from echelon.sim.watchers import HIGH_WATER, Reception
 from echelon.wire import data_key, encode, join, watch_key
 
@@ -114,19 +115,27 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
     done = threading.Event()
     teller = threading.Thread(target=_tell, args=(station, say, done), name="progress", daemon=True)
     teller.start()
+    failure: Failed | PartFailed | None = None
     try:
         runner.lockstep(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off; what was counted so far is still reported
         pass
     except BusError as error:
-        say(Failed(str(error)))
-        raise SystemExit(1) from None
+        failure = Failed(str(error))
+    except PartRunError as error:
+        failure = PartFailed(str(error))
     finally:
         runner.finish()
         done.set()
         teller.join()
-        station.stop()
+        try:
+            station.stop()
+        except PartRunError as error:
+            failure = failure or PartFailed(str(error))
         station.close()
+    if failure is not None:
+        say(failure)
+        raise SystemExit(1)
     signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
     report: Report = station.report()
     finish(spec, control, runner.counts, runner.mailbox.counts(), report)
@@ -153,17 +162,19 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
     control.send(bridge.progress())
     clock = bridge.clock = RunClock(meet(spec, session, control))
     said_ns = -1 << 62
-    while True:
-        wait_for([control, *bridge.sources], bridge.due_ns - clock.now())
-        bridge.serve()
-        now_ns = clock.now()
-        if now_ns - said_ns >= PROGRESS_NS:
-            said_ns = now_ns
-            control.send(bridge.progress())
-        if hear_finish(control) is not None:
-            break
-    bridge.stop()
-    bridge.close()
+    try:
+        while hear_finish(control) is None:
+            wait_for([control, *bridge.sources], bridge.due_ns - clock.now())
+            bridge.serve()
+            now_ns = clock.now()
+            if now_ns - said_ns >= PROGRESS_NS:
+                said_ns = now_ns
+                control.send(bridge.progress())
+    finally:  # however it ends
+        try:
+            bridge.stop()
+        finally:
+            bridge.close()
     finish(spec, control, report=bridge.report())
 
 

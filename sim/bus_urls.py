@@ -5,8 +5,8 @@ from pathlib import Path
 
 from echelon.bridge.bus_url import interface_is_up, resolve_url
 from echelon.can_plan import DISTURBANCES
+from echelon.errors import UsageError
 from echelon.plan import Plan
-from echelon.sim.usage import UsageError
 
 
 def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:

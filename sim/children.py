@@ -24,6 +24,8 @@ from echelon.sim.process import main
 from echelon.sim.to_supervisor import Done
 
 PRELOAD: Final = ["echelon.sim.process"]
+ENVIRONMENT: Final = {"PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""For the processes of a run.  A formation's matrices are small: threads of numpy's would only wait for each other"""
 LAST_WORDS: Final = 4000
 """Bytes kept of what a process says on standard error."""
 ROLES: Final = ("robot", "leader", "coordinator")
@@ -114,17 +116,18 @@ def warm_up() -> None:
 def _on_its_own() -> Iterator[None]:
     """Starts processes that see no module of the working folder (a user's `numpy.py` there is not numpy), and that do not
     run the calling script again: it needs no `if __name__ == "__main__":`, and may come from standard input."""
-    script, safe_path = sys.modules["__main__"], os.environ.get("PYTHONSAFEPATH")
+    script, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ENVIRONMENT}
     sys.modules["__main__"] = ModuleType("__main__")
-    os.environ["PYTHONSAFEPATH"] = "1"
+    os.environ |= ENVIRONMENT
     try:
         yield
     finally:
         sys.modules["__main__"] = script
-        if safe_path is None:
-            del os.environ["PYTHONSAFEPATH"]
-        else:
-            os.environ["PYTHONSAFEPATH"] = safe_path
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def start(spec: ProcessSpec) -> Child:

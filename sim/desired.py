@@ -7,8 +7,8 @@ the run left is to see the rest of it.
 import numpy as np
 
 from echelon.controller.trajectory import make_trajectory
+from echelon.errors import PartRunError
 from echelon.plan import Array, Plan
-from echelon.plugins import PartRunError
 from echelon.sim.time_limit import TookTooLong, time_limit
 
 PATIENCE_S = 2.0

@@ -4,19 +4,18 @@ Stages of one instant run in the order of their turns (`echelon.turns`).  What t
 mailboxes, and so through the same links, as between processes.
 """
 
-from collections.abc import Callable, Iterator
-from itertools import groupby
+from collections.abc import Callable, Iterator, Sequence
 from math import gcd
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from echelon.agents.robot import make_robot
 from echelon.controller.node import TreeNode
 from echelon.link import LinkCounts
 from echelon.mailbox import Mailbox
-from echelon.messages import Message
+from echelon.messages import Heard, Message
 from echelon.plan import NodePlan, Plan, RobotPlan
 from echelon.role import Role
-from echelon.turns import level
+from echelon.turns import Turn, level
 
 if TYPE_CHECKING:
     from echelon.bridge.commander import Commander
@@ -45,6 +44,30 @@ def make_role(plan: Plan, index: int) -> Role:
     return Commander(plan) if one.role == "bridge" else DriveBank(plan)
 
 
+class Row(NamedTuple):
+    """Stages that have their turn together, of all roles: (role, number of the stage, what it does, what it hears)."""
+
+    turn: Turn
+    period_ns: int
+    first_ns: int
+    stages: list[tuple[int, int, Callable[[int, Sequence[Heard]], tuple[Message, ...]], Mailbox]]
+
+    def is_due(self, time_ns: int) -> bool:
+        """True if these stages run at an instant."""
+        return time_ns % self.period_ns == 0 and time_ns >= self.first_ns
+
+
+def _timetable(plan: Plan, roles: Sequence[Role], mailboxes: Sequence[Mailbox]) -> list[Row]:
+    """Returns all stages of a run in the order of their turns."""
+    rows: dict[tuple[int, int, int], Row] = {}
+    for role in roles:
+        for number, stage in enumerate(role.stages):
+            key = level(plan, stage.turn, stage.depth), stage.period_ns, stage.first_ns
+            row = rows.setdefault(key, Row(stage.turn, stage.period_ns, stage.first_ns, []))
+            row.stages.append((role.index, number, stage.run, mailboxes[role.index]))
+    return [row for _, row in sorted(rows.items())]
+
+
 class Engine:
     """A run in one process."""
 
@@ -58,27 +81,11 @@ class Engine:
         for link in plan.links:
             receivers.setdefault((link.source, link.channel), []).append(self.mailboxes[link.receiver])
         self._receivers = receivers
-        stages = [
-            (
-                level(plan, stage.turn, stage.depth),
-                stage.period_ns,
-                stage.first_ns,
-                role.index,
-                number,
-                stage.run,
-                self.mailboxes[role.index],
-            )
-            for role in self.roles
-            for number, stage in enumerate(role.stages)
-        ]
-        self._stages = [
-            (period, first, [(number, run, mailbox) for *_, number, run, mailbox in group])
-            for (_, period, first), group in groupby(
-                sorted(stages, key=lambda stage: stage[:5]), key=lambda stage: stage[:3]
-            )
-        ]
-        self._tick_ns = gcd(*[period for period, _, _ in self._stages])
-        self._first_ns = min(first for _, first, _ in self._stages)
+        self.timetable = _timetable(plan, self.roles, self.mailboxes)
+        self.tick_ns = gcd(*[row.period_ns for row in self.timetable])
+        """Between two instants"""
+        self.first_ns = min(row.first_ns for row in self.timetable)
+        """The first instant: before 0 where drives are brought up"""
 
     @property
     def commander(self) -> "Commander | None":
@@ -93,12 +100,12 @@ class Engine:
     def instants(self) -> Iterator[int]:
         """Runs the whole plan, from 0 (or from when drives are brought up) to its duration inclusive; yields each instant
         [ns] when it is done."""
-        receivers, sink, stages = self._receivers, self._sink, self._stages
-        for time_ns in range(self._first_ns, self.plan.duration_ns + 1, self._tick_ns):
-            for period, first_ns, group in stages:
-                if time_ns % period or time_ns < first_ns:
+        receivers, sink = self._receivers, self._sink  # `post`, written out: this is the innermost loop of all runs
+        for time_ns in range(self.first_ns, self.plan.duration_ns + 1, self.tick_ns):
+            for _, period_ns, first_ns, stages in self.timetable:
+                if time_ns % period_ns or time_ns < first_ns:
                     continue
-                for number, run, mailbox in group:
+                for _, number, run, mailbox in stages:
                     for message in run(time_ns, mailbox.take(number, time_ns)):
                         self.messages += 1
                         for receiver in receivers.get((message.source, message.channel), ()):
@@ -106,6 +113,14 @@ class Engine:
                         if sink is not None:
                             sink(message)
             yield time_ns
+
+    def post(self, message: Message) -> None:
+        """Hands a message to all who hear it."""
+        self.messages += 1
+        for receiver in self._receivers.get((message.source, message.channel), ()):
+            receiver.deliver(message)
+        if self._sink is not None:
+            self._sink(message)
 
     def run(self) -> None:
         """Runs the whole plan."""

@@ -7,10 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.sim.results.blocks import block_series, component_names
-from echelon.sim.results.measures import link_result
+from echelon.sim.results.run import Run
 from echelon.sim.results.trace import Trace
 
 ROBOT_FIELDS: Final = ("x", "y", "theta", "v", "omega", "ax", "ay", "tau_right", "tau_left")
@@ -19,19 +18,18 @@ LINK_FIELDS: Final = (
 )  # fmt: skip
 
 
-def export_csv(trace: Trace, links: Sequence[LinkCounts], folder: Path) -> None:
-    """Writes `robots.csv`, `blocks.csv` and `links.csv` into a folder, which is made if need be.
+def export_csv(run: Run, folder: Path) -> list[Path]:
+    """Writes `robots.csv`, `blocks.csv` and `links.csv` into a folder, which is made if need be; returns them.
 
     Robots: every state of every robot, by time, then robot.  Blocks: at the instants at which every robot has a state,
     by time, block and component.  Links: one row each, ages in seconds.  Raises OSError.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / "robots.csv", ("t", "robot", *ROBOT_FIELDS), _robots(trace))
-    _write(folder / "blocks.csv", ("t", "block", "component", "value", "desired", "error", "rate"), _blocks(trace))
-    rows = (link_result(trace.plan, counts) for counts in links)
-    _write(
-        folder / "links.csv", LINK_FIELDS, (",".join(str(getattr(row, field)) for field in LINK_FIELDS) for row in rows)
-    )
+    files = [folder / name for name in ("robots.csv", "blocks.csv", "links.csv")]
+    _write(files[0], ("t", "robot", *ROBOT_FIELDS), _robots(run.trace))
+    _write(files[1], ("t", "block", "component", "value", "desired", "error", "rate"), _blocks(run.trace))
+    _write(files[2], LINK_FIELDS, (",".join(str(getattr(row, field)) for field in LINK_FIELDS) for row in run.links))
+    return files
 
 
 def _robots(trace: Trace) -> Iterable[str]:

@@ -1,6 +1,8 @@
 """Figures of a run as SVG text: trajectories, transformed state, errors, distances, wheel torques."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +28,7 @@ from echelon.sim.drawing import (
     time_axis,
 )
 from echelon.sim.results.blocks import Blocks, BlockSeries
-from echelon.sim.results.distances import Distances
+from echelon.sim.results.distances import Distances, distances
 from echelon.sim.results.measures import settling_ns
 from echelon.sim.results.trace import Trace
 
@@ -277,3 +279,39 @@ def _label(axes: Axes, at: Array, text: str, colour: str, shift: Sequence[float]
         text, (float(at[0]), float(at[1])), xytext=(shift[0], shift[1]), textcoords="offset points", color=colour,
         fontsize=8, zorder=8, **style,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure as SVG.  Jupyter shows it."""
+
+    svg: str
+
+    def _repr_svg_(self) -> str:
+        return self.svg
+
+    def save(self, path: str | Path) -> None:
+        """Writes it.  Raises OSError, and ValueError for a file that is not to be an SVG."""
+        path = Path(path)
+        if path.suffix != ".svg":
+            raise ValueError(f"{path}: must end in .svg")
+        path.write_text(self.svg, encoding="utf-8")
+
+
+FIGURES: Final = ("trajectories", "blocks", "errors", "distance", "torques")
+
+
+def picture(name: str, trace: Trace, blocks: Blocks, width: float = 11.5) -> Picture:
+    """Returns one of `FIGURES`, so many inches wide.  Raises KeyError for another name."""
+    match name:
+        case "trajectories":
+            return Picture(trajectories(trace, width))
+        case "blocks":
+            return Picture(transformed_state(blocks, trace.plan, width))
+        case "errors":
+            return Picture(errors(blocks, trace.plan, width))
+        case "distance":
+            return Picture(smallest_distance(distances(trace), trace.plan, width))
+        case "torques":
+            return Picture(wheel_torques(trace, width))
+    raise KeyError(f"no figure {name!r}; there are {', '.join(FIGURES)}")

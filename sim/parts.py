@@ -5,14 +5,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-import echelon.load
+import echelon.loading
 from echelon.agents.plant import PLANTS, Plant
+from echelon.bridge.protocol import DriveProtocol
+from echelon.bridge.protocols import DEFAULT, PROTOCOLS
+from echelon.bridge.trial import try_protocols
 from echelon.controller.laws import LAWS, Law
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
+from echelon.errors import PartRunError
 from echelon.explain import PartError
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.plan import Plan
-from echelon.plugins import Group, Part, PartRunError, Plugin, Registry, Source
+from echelon.plugins import Group, Part, Plugin, Registry, Source
 from echelon.scenario import Scenario
 from echelon.sim.probe import probe
 from echelon.sim.time_limit import TookTooLong, time_limit
@@ -49,6 +53,7 @@ REGISTRY: Final = PatientRegistry(
         "laws": Group("laws", Law, LAWS),
         "plants": Group("plants", Plant, PLANTS),
         "trajectories": Group("trajectories", Trajectory, TRAJECTORIES),
+        "protocols": Group("protocols", DriveProtocol, PROTOCOLS, DEFAULT),
     }
 )
 """All groups of parts, with what is built in."""
@@ -58,15 +63,20 @@ def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
     """Reads a scenario file, applies overrides `key=value`, makes its plan, and tries the parts in it that others wrote.
 
     Raises ScenarioError."""
-    scenario, plan = echelon.load.load(path, overrides, REGISTRY)
-    try:
-        probe(plan)
-    except PartRunError as error:
-        raise ScenarioError(f"{path}: {error}") from None
-    return scenario, plan
+    return _tried(str(path), *echelon.loading.load(path, overrides, REGISTRY))
 
 
 def parse(text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path()) -> tuple[Scenario, Plan]:
-    """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, `folder` holds files that the text
-    names.  Raises ScenarioError."""
-    return echelon.load.parse(text, name, overrides, REGISTRY, folder)
+    """Makes a scenario and its plan of TOML text, and tries the parts in it that others wrote; `name` stands for the file in
+    messages, `folder` holds files that the text names.  Raises ScenarioError."""
+    return _tried(name, *echelon.loading.parse(text, name, overrides, REGISTRY, folder))
+
+
+def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:
+    """Returns what was loaded, after a trial of what others wrote."""
+    try:
+        try_protocols(plan)
+        probe(plan)
+    except PartRunError as error:
+        raise ScenarioError(f"{name}: {error}") from None
+    return scenario, plan

@@ -15,8 +15,9 @@ from echelon.agents.plant import make_step, state_at
 from echelon.controller.laws.law import Block, law_block, make_nu, make_state, make_weight
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
+from echelon.errors import PartRunError
 from echelon.plan import Array, Plan, RobotPlan
-from echelon.plugins import Part, PartRunError
+from echelon.plugins import Part
 from echelon.sim.time_limit import TookTooLong, time_limit
 
 PATIENCE_S: Final = 2.0

@@ -15,7 +15,7 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Final
 
-from echelon.plugins import PartRunError
+from echelon.errors import PartRunError
 from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.contract import Body, ProcessSpec, StartError, finish, meet

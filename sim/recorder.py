@@ -137,12 +137,12 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
 
     if plan.bridge is not None:
         for robot in plan.robots:
-            add(Channel.TORQUE, robot.index, f"/{robot.path}/torque", "WheelTorque", ros.wheel_torque())
+            add(Channel.TORQUE, robot.index, f"/{ros.ros_name(robot.path)}/torque", "WheelTorque", ros.wheel_torque())
         add(Channel.WHEELS, plan.bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
     for node in plan.nodes:
-        prefix = f"/{node.path}/".replace("//", "/")
+        prefix = f"/{ros.ros_name(node.path)}/".replace("//", "/")
         layout = NodeLayout.of(plan, node)
         if node.parent is not None:
             state = layout.state
@@ -160,9 +160,9 @@ def frame_topics(plan: Plan) -> list[str]:
     """Returns the topics of the frames, bus by bus."""
     if len(plan.can.buses) == 1:
         return [FRAMES]
-    return [f"/can/{bus.name}/frames" for bus in plan.can.buses]
+    return [f"/can/{ros.ros_name(bus.name)}/frames" for bus in plan.can.buses]
 
 
 def state_topic(path: str) -> str:
     """Returns the topic of a robot's state."""
-    return f"/{path}/state"
+    return f"/{ros.ros_name(path)}/state"

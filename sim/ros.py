@@ -74,6 +74,11 @@ DEFINITIONS: Final = {
 """Message definitions by name, without the middle `msg`; a definition names the types of its fields in full."""
 
 
+def ros_name(path: str) -> str:
+    """Returns a path of names as ROS allows it in topics and frames, where hyphens are not: `g-1/r2` is `g_1/r2`."""
+    return path.replace("-", "_")
+
+
 def schema_name(name: str) -> str:
     """Returns a type's name with the middle `msg`: `nav_msgs/Odometry` is `nav_msgs/msg/Odometry`."""
     return name.replace("/", "/msg/")

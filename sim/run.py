@@ -11,7 +11,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from hashlib import blake2b
@@ -23,10 +23,10 @@ from echelon import __version__
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
-from echelon.load import effective_toml
+from echelon.errors import PartRunError
+from echelon.loading import effective_toml
 from echelon.messages import Message
 from echelon.plan import Plan
-from echelon.plugins import PartRunError
 from echelon.scenario import Scenario
 from echelon.sim.engine import Engine
 from echelon.sim.foreign_parts import stalled_in, unstalled
@@ -45,20 +45,6 @@ PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
 FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finished:
-    """A finished run: its folder, its summary, and its trace."""
-
-    folder: Path
-    summary: Summary
-    trace: Trace
-
-    @property
-    def failure(self) -> str | None:
-        """Why it broke off, if it did."""
-        return self.summary.run.failure
 
 
 def new_folder(scenario: Scenario, out: Path | None) -> Path:
@@ -88,9 +74,10 @@ def execute(
     can_urls: tuple[str, ...],
     display: Display,
     stall_timeout_s: float = 30.0,
-) -> Finished:
-    """Runs a plan and writes the run's folder, except for the report.  Raises OSError if a file cannot be written, and
-    ValueError too if, in one process, the bus cannot be had."""
+) -> tuple[Summary, Trace]:
+    """Runs a plan and writes the run's folder, except for the report; returns its summary and its trace.
+
+    Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
     begun = datetime.now(UTC)
     parts = keep_parts(scenario, folder)
     toml = effective_toml(scenario, parts.names)
@@ -121,13 +108,16 @@ def execute(
         ).run()
     can = outcome.can
     if can is not None and can.referee is None:
-        can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not outcome.failure))
+        try:
+            can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not outcome.failure))
+        except PartRunError as error:
+            outcome.failure = outcome.failure or str(error)
     display.close()
     summary = summarise(
         outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun), parts.results
     )
     write_summary(summary, folder / "summary.json")
-    return Finished(folder, summary, outcome.trace)
+    return summary, outcome.trace
 
 
 def judged(log: Path, plan: Plan, clock: str, whole: bool) -> RefereeReport:
@@ -180,23 +170,26 @@ def _in_process(
             if recording.recorder.failure:
                 failure = f"the recording failed: {recording.recorder.failure}"
                 break
+    except PartRunError as error:
+        failure = str(error)
     except KeyboardInterrupt:
         failure = "interrupted"
         bridge.interrupt()
-    except PartRunError as error:
-        failure = str(error)
     except TookTooLong as error:
         who = stalled_in(plan, error)
         failure = f"stalled for {stall_timeout_s:.0f} s at t = {time_ns / 1e9:g} s: everyone waits for {who}"
     wall_s = time.monotonic() - begun_s
     try:
         pass_on()
-    except SystemExit:
+    except (SystemExit, PartRunError):
         pass
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
-    bridge.stop()
+    try:
+        bridge.stop()
+    except PartRunError as error:
+        failure = failure or str(error)
     bridge.close()
     recorded = recording.report()
     failure = failure or (f"the recording failed: {recorded.failure}" if recorded.failure else None)

@@ -1,4 +1,4 @@
-"""Reads back the folder of a run, for reports and exports."""
+"""Reads back the folder of a run."""
 
 from itertools import islice
 from pathlib import Path
@@ -8,35 +8,48 @@ import cantools
 
 from echelon.bridge.canlog import Logged, read_log
 from echelon.bridge.plan_dbc import plan_dbc
-from echelon.load import ScenarioError
+from echelon.errors import UserError
 from echelon.plan import Plan
-from echelon.sim.parts import parse
+from echelon.shipped import EFFECTIVE
+from echelon.sim.parts import load
 from echelon.sim.recording import read_trace
 from echelon.sim.report import RunForReport, write_report
 from echelon.sim.results.rendering import read_summary
-from echelon.sim.usage import UsageError
+from echelon.sim.results.run import Run
 
 FRAMES: Final = 18
 """So many frames a report shows, from run time 0 on."""
 
 
-def read_run(folder: Path) -> RunForReport:
-    """Reads a run's folder.  Raises UsageError."""
+def open_run(folder: Path) -> Run:
+    """Opens the folder that a run left.  Raises UserError."""
     try:
-        toml = (folder / "scenario.toml").read_text(encoding="utf-8")
+        _, plan = load(folder / EFFECTIVE)
         summary = read_summary(folder / "summary.json")
-        _, plan = parse(toml, str(folder / "scenario.toml"), (), folder)
+    except OSError as error:
+        raise UserError(f"{error.filename}: {error.strerror}") from None
+    except ValueError as error:
+        raise UserError(f"{folder / 'summary.json'}: {error}") from None
+    try:
         trace = read_trace(folder / "run.mcap", plan)
     except OSError as error:
-        raise UsageError(f"{error.filename}: {error.strerror}") from None
-    except (ScenarioError, ValueError) as error:
-        raise UsageError(f"{folder}: {error}") from None
-    return RunForReport(folder.name, trace, summary, toml, first_frames(folder / "can.log", plan))
+        raise UserError(f"{error.filename}: {error.strerror}") from None
+    except ValueError as error:  # which begins with the file
+        raise UserError(str(error)) from None
+    return Run(trace, summary, folder)
+
+
+def _for_report(folder: Path) -> RunForReport:
+    """Opens a run's folder for a report.  Raises UserError and OSError."""
+    run = open_run(folder)
+    toml = (folder / EFFECTIVE).read_text(encoding="utf-8")
+    frames = first_frames(folder / "can.log", run.plan)
+    return RunForReport(folder.resolve().name, run.trace, run.summary, toml, frames)
 
 
 def report_on(folders: list[Path], path: Path) -> None:
-    """Writes a report of runs.  Raises UsageError and OSError."""
-    write_report([read_run(folder) for folder in folders], path)
+    """Writes a report of runs.  Raises UserError and OSError."""
+    write_report([_for_report(folder) for folder in folders], path)
 
 
 def first_frames(path: Path, plan: Plan, count: int = FRAMES) -> tuple[dict[str, object], ...]:

@@ -42,7 +42,8 @@ class Scene:
             self.states.append(state)
         self.topics = {TF: "tf2_msgs/TFMessage", MARKERS: "visualization_msgs/MarkerArray"}
         self.topics |= {JOINT_STATES: "sensor_msgs/JointState"}
-        self.topics |= {f"/{robot.path}/odom": "nav_msgs/Odometry" for robot in plan.robots}
+        names = [ros.ros_name(robot.path) for robot in plan.robots]
+        self.topics |= {f"/{name}/odom": "nav_msgs/Odometry" for name in names}
         """The type of each topic that `messages` fills."""
         self._arm = np.array([robot.arm for robot in plan.robots])
         self._offset = np.array([robot.offset for robot in plan.robots])
@@ -50,9 +51,9 @@ class Scene:
         self._means = np.zeros((len(plan.nodes), len(plan.robots)))
         for row, node in enumerate(plan.nodes):
             self._means[row, node.first_robot : node.first_robot + node.robots] = 1 / node.robots
-        self._transforms = ros.transforms([robot.path for robot in plan.robots])
-        self._joints = ros.joint_state([f"{robot.path}/{side}" for robot in plan.robots for side in ("right", "left")])
-        self._odometry = {f"/{robot.path}/odom": ros.odometry(robot.path) for robot in plan.robots}
+        self._transforms = ros.transforms(names)
+        self._joints = ros.joint_state([f"{name}/{side}" for name in names for side in ("right", "left")])
+        self._odometry = {f"/{name}/odom": ros.odometry(name) for name in names}
         self._markers = _markers(plan)
 
     def messages(self, time_ns: int) -> list[tuple[str, bytes]]:

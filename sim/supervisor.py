@@ -7,7 +7,7 @@ They talk over the loopback, at an address and ports of this run's own.
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -22,6 +22,8 @@ from echelon.sim.results.trace import Array, Trace, TraceBuilder
 from echelon.sim.to_process import End, Finish, Start, Told
 from echelon.sim.to_supervisor import Done, Failed, PartFailed, Ready, RecorderProgress, RecorderReport, Said, Waiting
 
+NAMED: Final = 12
+"""Processes that a note names; what is more is counted."""
 START_TIMEOUT_S: Final = 30.0
 STALL_REPORT_S: Final = 3.0
 """A run in virtual time that stands still for so long is reported, with the process everyone waits for."""
@@ -162,9 +164,9 @@ class Supervisor:
                     for child in self._children
                     if not (child.ready if what == "not ready" else child.done or not child.is_member)
                 ]
-                names = [child.name for child in late]
-                who = ", ".join(child.name + child.runs() for child in late)
-                raise RunError(f"{what} after {timeout_s:g} s: {who}{self._words_of(names)}")
+                who = few([child.name + child.runs() for child in late])
+                words = self._words_of([child.name for child in late[:NAMED]])
+                raise RunError(f"{what} after {timeout_s:g} s: {who}{words}")
 
     def _serve(self, timeout_s: float) -> None:
         """Takes what children say on their control pipes and on standard error."""
@@ -205,7 +207,12 @@ class Supervisor:
                 if said.failure and progress.phase == "running":
                     raise RunError(f"the recording failed: {said.failure}")
             case Failed():
-                raise RunError(f"{child.spec.kind} {child.name} cannot start: {said.text}")
+                starting = progress.phase == "starting"
+                raise RunError(
+                    f"{child.spec.kind} {child.name} cannot start: {said.text}"
+                    if starting
+                    else f"{child.name}: {said.text}"
+                )
             case PartFailed():
                 raise RunError(said.text)
             case Done():
@@ -260,16 +267,16 @@ class Supervisor:
                 if child.is_member and child.done is None and now_s - child.heard_s > 2
             ]
         if silent:
-            return "everyone waits for " + ", ".join(
-                f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent
+            return "everyone waits for " + few(
+                [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent]
             )
         members = self.plan.all_roles
         waits = [
-            f"{child.name} for {', '.join(members[source].name for source in child.waiting_for)}"
+            f"{child.name} for {few([members[source].name for source in child.waiting_for])}"
             for child in self._children
             if child.waiting_for
         ]
-        return "all wait: " + "; ".join(waits)
+        return "all wait: " + few(waits, "; ")
 
     def _stop_members(self) -> None:
         """Ends the members of a run that broke off: first asked, so that what they hold back is sent, then made to."""
@@ -388,6 +395,12 @@ class Supervisor:
                 child.control.send(message)
             except OSError:
                 pass  # lost; `_check_lost` will say so
+
+
+def few(names: Sequence[str], between: str = ", ") -> str:
+    """Returns a list of names as text, with a dozen of them at most."""
+    more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
+    return between.join([*names[:NAMED], *more])
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -10,6 +10,9 @@ from typing import Any, Self
 from echelon.bridge.bus import open_bus
 from echelon.bridge.frame import Drive, Frame
 from echelon.can_plan import DrivePlan, EnvelopePlan, MotorPlan
+from echelon.plugins import Part
+from echelon.sim.parts import REGISTRY
+from tests.runs import EXAMPLES
 
 MS = 1_000_000
 
@@ -42,12 +45,20 @@ def motor_plan(**changes: Any) -> MotorPlan:
     return replace(MOTOR, **changes)
 
 
-def drive_plan(protocol: str, node_ids: tuple[int, int] = (1, 2), **changes: Any) -> DrivePlan:
-    """Returns the plan of a robot's drives with changes: 100 Hz, watchdog 100 ms, no recovery."""
+def protocol(use: str) -> Part[Any]:
+    """Returns a protocol that is built in, or one in a file of the examples."""
+    return REGISTRY.make("protocols", use, {}, EXAMPLES)
+
+
+def drive_plan(use: str, node_ids: tuple[int, int] | None = None, **changes: Any) -> DrivePlan:
+    """Returns the plan of a robot's drives with changes: 100 Hz, watchdog 100 ms, no recovery.
+
+    Unless given, their nodes are 1 and 2, or the robot's number, 3, where that is the node."""
+    part = protocol(use)
     plan = DrivePlan(
-        protocol=protocol,
+        protocol=part,
         bus=0,
-        node_ids=node_ids,
+        node_ids=node_ids or ((3, 3) if part.made.by_number else (1, 2)),
         period_ns=10 * MS,
         watchdog_ns=100 * MS,
         torque_scale=0.001,

@@ -25,7 +25,7 @@ class Rig:
         self.plan = plan
         self.time_ns = -200 * MS
         self.drives = [Cia402Drive(plan, wheel) for wheel in (0, 1)]
-        self.host = Cia402Host(plan, 0)
+        self.host = Cia402Host(plan)
         self.master = Master(plan.period_ns, plan.watchdog_ns)
         self.listen: Callable[[int, Frame], object] = lambda time_ns, frame: None
         self.lose: Callable[[Frame], bool] = lambda frame: False

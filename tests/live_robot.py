@@ -9,9 +9,8 @@ import numpy as np
 import tomlkit
 
 from echelon.bridge.bus import open_bus
-from echelon.bridge.cia402.host import Master
 from echelon.bridge.frame import Frame
-from echelon.bridge.protocols import drive_places, make_drive, make_host
+from echelon.bridge.protocols import drive_places, make_drive, make_host, make_masters
 from echelon.plan import Plan
 from echelon.sim.parts import load
 from tests.bench_drives import Bench
@@ -44,7 +43,7 @@ class LiveRobot:
         self._host = make_host(plan.robots[0])
         drive = plan.robots[0].drive
         self._period_s = drive.period_ns / 1e9
-        self._master = Master(drive.period_ns, drive.watchdog_ns) if drive.protocol == "cia402" else None
+        self._masters = [master for _, master in make_masters(plan)]
         self._bus = open_bus(url)
         self._end = threading.Event()
         self.enabled = threading.Event()
@@ -67,8 +66,9 @@ class LiveRobot:
         while not self._end.is_set():
             now_ns = time.monotonic_ns()
             frames = self._host.poll(now_ns) + self._host.command(now_ns, *TORQUES)
-            if self._master is not None:
-                frames += [*self._master.poll(now_ns), self._master.sync()]
+            for master in self._masters:
+                sync = master.sync()
+                frames += [*master.poll(now_ns), *([] if sync is None else [sync])]
             for can_id, data, remote in frames:
                 self._bus.send(can_id, data, remote=remote)
             if self._host.enabled:

@@ -15,6 +15,7 @@ from echelon.sim.results.trace import Trace, TraceBuilder
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIOS = ROOT / "deploy" / "scenarios"
+EXAMPLES = ROOT / "examples"
 
 
 def plan_of(name: str, *overrides: str) -> Plan:
@@ -29,16 +30,13 @@ def trace_of(plan: Plan) -> Trace:
     return builder.build()
 
 
-def echelon(*arguments: str | Path, timeout: float = 120, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Runs the command line to its end."""
+def echelon(
+    *arguments: str | Path, timeout: float = 120, cwd: Path = ROOT, typed: str = "", **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Runs the command line to its end; `typed` is what it finds on standard input."""
+    command = [sys.executable, "-m", "echelon", *map(str, arguments)]
     return subprocess.run(
-        [sys.executable, "-m", "echelon", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        cwd=options.pop("cwd", ROOT),
-        stdin=subprocess.DEVNULL,
-        **options,
+        command, capture_output=True, text=True, timeout=timeout, cwd=cwd, input=typed, check=False, **options
     )
 
 

@@ -7,25 +7,32 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.bridge.bus_load import frame_bits
+from echelon.bridge.frame import Frame
 from echelon.bridge.native.codec import NativeCodec, Torque
 from echelon.bridge.native.counter import CounterCheck
+from echelon.bridge.native.host import NativeHost
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.torque_mirror import Stop, TorqueMirror
+from tests.bench_drives import drive_plan
 
 MS = 1_000_000
 CODEC = NativeCodec(0.001)
 
 
 def make() -> TorqueMirror:
-    return TorqueMirror(["g1/r1", "g1/r2"], 0.001, 10 * MS)
+    return TorqueMirror([host(0), host(1)], 10 * MS)
+
+
+def host(robot: int) -> NativeHost:
+    return NativeHost(drive_plan("native", (robot, robot)))
 
 
 def said(robot: int, right: float, left: float, enable: bool, counter: int) -> Torque:
     return Torque(robot, right, left, enable, enable, False, False, False, False, counter)
 
 
-def decode(frames: list[tuple[int, bytes]]) -> Torque:
-    ((can_id, data),) = frames
+def decode(frames: list[Frame]) -> Torque:
+    ((can_id, data, _),) = frames
     frame = CODEC.decode(can_id, data)
     assert isinstance(frame, Torque)
     return frame
@@ -39,7 +46,7 @@ def test_one_frame_per_robot_and_period_in_order() -> None:
     ]
     assert bridge.frames == 40
     assert sum(counts.bits.bits for counts in bridge.counts) == sum(
-        frame_bits(can_id, data) for ((can_id, data),) in frames
+        frame_bits(can_id, data) for ((can_id, data, _),) in frames
     )
     assert [counts.skipped for counts in bridge.counts] == [0, 0]
 
@@ -98,7 +105,7 @@ def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> Non
     checks = [CounterCheck(), CounterCheck()]
     total = 0
     for time, robot, right, left, saturated in calls:
-        for can_id, data in bridge.encode(time * 10 * MS, robot, right, left, saturated):
+        for can_id, data, _ in bridge.encode(time * 10 * MS, robot, right, left, saturated):
             frame = CODEC.decode(can_id, data)
             assert isinstance(frame, Torque)
             assert frame.robot == robot
@@ -112,9 +119,7 @@ def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> Non
 
 
 def test_refused() -> None:
-    with pytest.raises(ValueError, match="127 robots"):
-        TorqueMirror(["r"] * 128, 0.001, 1)
     with pytest.raises(ValueError, match="period"):
-        TorqueMirror(["r"], 0.001, 0)
+        TorqueMirror([host(0)], 0)
     with pytest.raises(IndexError):
         make().encode(0, 2, 0.0, 0.0)

@@ -13,10 +13,12 @@ from runs import echelon, plan_of, start_echelon, until
 from echelon.bridge.bus import open_bus
 from echelon.bridge.bus_load import worst_case_bits
 from echelon.bridge.canlog import read_log
+from echelon.bridge.cyclic import WheelState
 from echelon.bridge.frame import Frame
-from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, encode_status
 from echelon.bridge.referee import Referee
 from echelon.cli import main
+from echelon.cli.listening import show_live
 from echelon.sim.can_table import HALF, CanTable, Rate, bar
 from tests.live_robot import TORQUES, LiveRobot, one_robot
 
@@ -258,17 +260,12 @@ def test_a_bus_that_is_alive(protocol: str, tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_table_in_a_terminal(tmp_path: Path) -> None:
-    from argparse import Namespace
-
-    from echelon.sim import can_commands
-
-    path, plan = one_robot(tmp_path)
+    _, plan = one_robot(tmp_path)
     url = free_url()
     console = Console(file=io.StringIO(), record=True, force_terminal=True, width=120, color_system="standard")
-    arguments = Namespace(scenario=str(path), set=None, can=url, seconds=1.0, json=False, speed=None)
     with LiveRobot(plan, url) as robot:
         assert robot.enabled.wait(20.0)
-        assert can_commands.can(arguments, console) == 0
+        show_live(plan, url, 1.0, as_json=False, console=console)
     text = console.export_text()
     assert "enabled" in text
     assert "-0.500" in text

@@ -103,7 +103,7 @@ def test_first_torque_after_enabling_is_zero() -> None:
 
 def test_another_rated_torque_is_not_enabled() -> None:
     rig = Rig(plan_of())
-    rig.host = Cia402Host(plan_of(motor=motor_plan(rated_torque=1.1)), 0)
+    rig.host = Cia402Host(plan_of(motor=motor_plan(rated_torque=1.1)))
     rig.cycles(100, 0.5, 0.5)
     assert not rig.host.enabled
     assert rig.host.fault == "; ".join(
@@ -296,11 +296,11 @@ def test_frames_that_are_none() -> None:
 
 def test_callers_mistakes() -> None:
     with pytest.raises(ValueError, match="twice 5"):
-        Cia402Host(replace(plan_of(), node_ids=(5, 5)), 0)
+        Cia402Host(replace(plan_of(), node_ids=(5, 5)))
     with pytest.raises(ValueError, match="node id"):
-        Cia402Host(replace(plan_of(), node_ids=(5, 127)), 0)
+        Cia402Host(replace(plan_of(), node_ids=(5, 127)))
     with pytest.raises(ValueError, match="finite"):
-        Cia402Host(plan_of(), 0).command(0, nan, 0.0)
+        Cia402Host(plan_of()).command(0, nan, 0.0)
     for bad in ((0, 1), (1, 0)):
         with pytest.raises(ValueError, match="positive"):
             Master(*bad)

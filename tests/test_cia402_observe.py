@@ -11,7 +11,7 @@ from cantools.database import Database
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon.bridge.cia402.dbc import messages
+from echelon.bridge.cia402.dbc import messages, shared_messages
 from echelon.bridge.cia402.observe import Cia402Observer
 from echelon.bridge.frame import Frame
 from echelon.bridge.motor import LATCHING, Fault
@@ -25,7 +25,7 @@ class Heard:
 
     def __init__(self, **changes: Any) -> None:
         self.rig = Rig(plan_of(**changes))
-        self.observer = Cia402Observer(self.rig.plan, ENVELOPE, 0)
+        self.observer = Cia402Observer(self.rig.plan, ENVELOPE)
         self.findings: list[Finding] = []
         self.rig.listen = self.listen
 
@@ -217,7 +217,7 @@ def test_pdos_of_a_node_that_is_not_operational() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans()), max_size=200))
 def test_arbitrary_frames_never_raise(frames: list[tuple[int, bytes, bool]]) -> None:
-    observer = Cia402Observer(plan_of(), ENVELOPE, 0)
+    observer = Cia402Observer(plan_of(), ENVELOPE)
     known = sorted(observer.identifiers)
     for time_ns, (can_id, data, remote) in enumerate(frames):
         observer.observe(time_ns, Frame(known[can_id % len(known)], data, remote))
@@ -226,19 +226,19 @@ def test_arbitrary_frames_never_raise(frames: list[tuple[int, bytes, bool]]) -> 
 
 def test_the_dbc_says_what_the_frames_say() -> None:
     plan = plan_of(motor=motor_plan(rated_torque=0.8, lag=0.002, torque_slew=inf))
-    text = Database(messages(plan, "g1/r2")).as_dbc_string()
+    shared = shared_messages(plan.period_ns, plan.watchdog_ns)
+    text = Database([*messages(plan, "g1/r2"), *shared]).as_dbc_string()
     dbc = cantools.database.load_string(text, "dbc")
     assert isinstance(dbc, Database)
     rig = Rig(plan)
     seen: dict[str, dict[str, Any]] = {}
 
     def listen(time_ns: int, frame: Frame) -> None:
-        if frame.can_id in {message.frame_id for message in dbc.messages}:
-            message = dbc.get_message_by_frame_id(frame.can_id)
-            assert message.length == len(frame.data)
-            decoded = message.decode(frame.data)
-            assert isinstance(decoded, dict)
-            seen[message.name] = decoded
+        message = dbc.get_message_by_frame_id(frame.can_id)  # there is one for each frame
+        assert message.length == len(frame.data)
+        decoded = message.decode(frame.data)
+        assert isinstance(decoded, dict)
+        seen[message.name] = decoded
 
     rig.listen = listen
     rig.bring_up()
@@ -261,6 +261,9 @@ def test_the_dbc_says_what_the_frames_say() -> None:
         "error_register": "5",
     }
     assert str(seen["g1_r2_left_heartbeat"]["state"]) == "operational"
-    assert len(seen) == 13  # no emergency of the right one
-    cycles = {message.name.rpartition("_")[2]: message.cycle_time for message in dbc.messages}
-    assert cycles == {"RPDO1": None, "RPDO2": 10, "TPDO1": 10, "TPDO2": 10, "TPDO3": 10, "EMCY": None, "heartbeat": 40}
+    assert {str(seen["NMT"]["command"]), seen["NMT"]["node"]} == {"start", 6}
+    assert seen["g1_r2_right_SDO_answer"]["command"] == 0x60  # a download was taken
+    assert str(seen["bridge_heartbeat"]["state"]) == "operational"
+    assert {message.name for message in dbc.messages} - seen.keys() == {"g1_r2_right_EMCY"}
+    cycles = {message.name.rpartition("_")[2]: message.cycle_time for message in dbc.messages if message.cycle_time}
+    assert cycles == {"RPDO2": 10, "TPDO1": 10, "TPDO2": 10, "TPDO3": 10, "heartbeat": 40, "SYNC": 10}

@@ -3,6 +3,7 @@
 import csv
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -155,7 +156,7 @@ def test_a_folder_may_have_any_name_and_a_run_a_single_tick(tmp_path: Path) -> N
 
 
 def test_no_room_for_the_first_file_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "echelon.cli", "run", "paper", *QUICK, "--can", "none", "--quiet", "--json"]
+    command = [sys.executable, "-m", "echelon", "run", "paper", *QUICK, "--can", "none", "--quiet", "--json"]
     limited = f"ulimit -f 1; exec {shlex.join(command)} --out {shlex.quote(str(tmp_path))}"
     done = subprocess.run(["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 3
@@ -172,11 +173,33 @@ def test_a_bus_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
     assert not json.loads(done.stdout)["verdict"]["holds"]
 
 
+def test_a_default_folder_that_cannot_be_made_is_named() -> None:
+    done = echelon("run", "paper", *QUICK, "--engine", "inprocess", "--quiet", cwd=Path("/proc"))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("echelon: runs")
+    assert done.stderr.endswith("; give a folder with --out\n")
+    assert "None" not in done.stderr
+
+
 def test_recover_refuses_what_is_no_recording(tmp_path: Path) -> None:
     (tmp_path / "not.mcap").write_text("hello")
     done = echelon("recover", tmp_path / "not.mcap")
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"echelon: {tmp_path}/not.mcap: is no MCAP file\n"
+
+
+def test_what_is_wrong_with_a_runs_folder_names_the_file_once(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / "run.mcap").write_bytes((folder / "run.mcap").read_bytes()[:50_000])
+    for command in ("report", "export"):
+        done = echelon(command, run)
+        assert done.returncode == 2
+        assert done.stderr == f"echelon: {run}/run.mcap: is cut short; mend it with `echelon recover`\n"
+    (run / "summary.json").write_text("{")
+    done = echelon("report", run)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert done.stderr.startswith(f"echelon: {run}/summary.json: is no summary that can be read: ")
 
 
 def test_recover_mends_a_cut_recording(folder: Path, tmp_path: Path) -> None:
@@ -186,6 +209,10 @@ def test_recover_mends_a_cut_recording(folder: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "messages, up to t =" in done.stdout
     read_trace(tmp_path / "cut-recovered.mcap", plan_of("paper", "duration=0.2"))
+    facts = json.loads(echelon("recover", tmp_path / "cut.mcap", "--out", tmp_path / "x.mcap", "--json").stdout)
+    assert facts["file"] == str(tmp_path / "x.mcap")
+    assert (facts["messages"] > 100, 0 < facts["until"] < 0.2, facts["complete"]) == (True, True, False)
+    assert (tmp_path / "x.mcap").read_bytes() == (tmp_path / "cut-recovered.mcap").read_bytes()
 
 
 def test_export_writes_tables(folder: Path, tmp_path: Path) -> None:
@@ -201,10 +228,30 @@ def test_export_writes_tables(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "links.csv").exists()
 
 
+def test_export_goes_into_the_runs_folder_and_says_so(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    done = echelon("export", run)
+    assert (done.returncode, done.stdout) == (0, f"{run}/csv: robots.csv, blocks.csv, links.csv\n"), done.stderr
+    assert {path.name for path in (run / "csv").iterdir()} == {"robots.csv", "blocks.csv", "links.csv"}
+    facts = json.loads(echelon("export", run, "--csv", tmp_path / "tables", "--json").stdout)
+    assert (facts["run"], facts["folder"]) == (str(run), str(tmp_path / "tables"))
+    assert all((tmp_path / "tables" / name).exists() for name in facts["files"])
+    refused = echelon("export", run, "--csv", run / "run.mcap")
+    assert refused.stderr == f"echelon: --csv {run}/run.mcap: File exists\n"
+
+
 def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "both.html"
     assert echelon("report", folder, folder, "--out", page).returncode == 0
     assert page.stat().st_size > 10_000
+    done = echelon("report", folder, folder, "--out", page, "--json")
+    assert json.loads(done.stdout) == {"report": str(page), "runs": [str(folder), str(folder)]}
+
+
+def test_a_report_is_called_after_the_runs_folder_wherever_one_stands(folder: Path, tmp_path: Path) -> None:
+    assert echelon("report", ".", "--out", tmp_path / "page.html", cwd=folder).returncode == 0
+    assert "<title>paper: short</title>" in (tmp_path / "page.html").read_text()
 
 
 def test_validate_explains_and_speaks_json() -> None:
@@ -245,7 +292,7 @@ def test_help_teaches() -> None:
 
 
 def test_a_closed_pipe_is_no_error() -> None:
-    command = f"{sys.executable} -m echelon.cli dbc paper | head -n 1; exit ${{PIPESTATUS[0]}}"
+    command = f"{sys.executable} -m echelon dbc paper | head -n 1; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0
     assert not done.stderr

@@ -9,7 +9,8 @@ import cantools
 import pytest
 from cantools.database.can import Database
 
-from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status, frame_id
+from echelon.bridge.cyclic import WheelState
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, encode_status, frame_id
 from echelon.bridge.plan_dbc import identifiers
 from tests.runs import lab_dbc
 

@@ -1,5 +1,6 @@
 """Virtual drives alone on a bus: what they say of themselves, and that a host can command them."""
 
+import json
 import signal
 import time
 from pathlib import Path
@@ -12,7 +13,7 @@ from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import resolve_url
 from echelon.bridge.frame import Frame, Host
 from echelon.bridge.protocols import make_host
-from echelon.sim.drives_command import describe
+from echelon.cli.drive_bench import bench_facts, bench_lines
 
 PATIENCE_S = 20.0
 
@@ -94,10 +95,24 @@ def test_drives_that_nobody_could_hear(url: str) -> None:
     assert "udp_multicast" in done.stderr
 
 
+def test_scripts_get_an_object_of_what_is_there_and_one_each_second() -> None:
+    with own_bus() as bus:
+        done = echelon("drives", "lab", "--can", bus.url, "--seconds", "1.3", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    bench, *states = map(json.loads, done.stdout.splitlines())
+    assert [robot["name"] for robot in bench["robots"]][:2] == ["g1/r1", "g1/r2"]
+    assert bench["robots"][1]["place"] == "command 0x101, feedback 0x181, status 0x201"
+    assert (bench["buses"][0]["url"], bench["period"], bench["watchdog"]) == (bus.url, 0.01, 0.1)
+    assert len(states) == 2
+    assert states[-1]["sent"] > states[0]["sent"] > 0
+    assert (states[-1]["received"], states[-1]["wheels"], states[-1]["refused"]) == (0, [], {})
+
+
 def test_what_there_is_to_command() -> None:
-    lines = describe(plan_of("lab", "can.path=closed"), ["socketcan:can3"])
+    lines = bench_lines(bench_facts(plan_of("lab", "can.path=closed"), ["socketcan:can3"]))
     assert lines[0] == "bus can0: socketcan:can3; to listen: candump can3"
     assert lines[2] == "  g1/r2  native on can0, command 0x101, feedback 0x181, status 0x201"
     assert lines[-1] == "they report every 10 ms, and stop after 100 ms without a command"
-    lines = describe(plan_of("lab", "can.path=closed", 'robot.drive.protocol="cia402"'), ["socketcan:can3"])
+    other = plan_of("lab", "can.path=closed", 'robot.drive.protocol="cia402"')
+    lines = bench_lines(bench_facts(other, ["socketcan:can3"]))
     assert lines[2] == "  g1/r2  cia402 on can0, nodes 3 right, 4 left"

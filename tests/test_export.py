@@ -1,14 +1,22 @@
 """CSV files: every float reads back as the float it was, rows stand in their order."""
 
 import csv
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from synthetic import FIELD, decaying, link_counts
+from synthetic import FIELD, decaying, link_counts, run_facts
 
+from echelon.link import LinkCounts
 from echelon.sim.export import ROBOT_FIELDS, export_csv
 from echelon.sim.results.blocks import block_series
+from echelon.sim.results.run import Run
+from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+
+
+def finished(trace: Trace, links: Sequence[LinkCounts] = ()) -> Run:
+    return Run(trace, summarise(trace, links, None, run_facts()))
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +31,7 @@ def run():
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "new" / "csv"
-    export_csv(run.trace, link_counts(run.plan), path)
+    export_csv(finished(run.trace, link_counts(run.plan)), path)
     return path
 
 
@@ -76,7 +84,7 @@ def test_robots_of_different_length_keep_all_their_states_in_order_of_time(run, 
     short = Trace(
         trace.plan, (trace.times_ns[0][10:20], *trace.times_ns[1:]), (trace.states[0][10:20], *trace.states[1:])
     )
-    export_csv(short, [], tmp_path)
+    export_csv(finished(short), tmp_path)
     found = rows(tmp_path / "robots.csv")
     assert len(found) == sum(len(times) for times in short.times_ns)
     times = [float(row["t"]) for row in found]
@@ -89,6 +97,6 @@ def test_robots_of_different_length_keep_all_their_states_in_order_of_time(run, 
 def test_what_is_not_finite_is_written_as_it_is(run, tmp_path):
     states = [part.copy() for part in run.trace.states]
     states[0][1, FIELD["x"]], states[0][2, FIELD["x"]] = np.nan, -np.inf
-    export_csv(Trace(run.plan, run.trace.times_ns, tuple(states)), [], tmp_path)
+    export_csv(finished(Trace(run.plan, run.trace.times_ns, tuple(states))), tmp_path)
     found = [row["x"] for row in rows(tmp_path / "robots.csv") if row["robot"] == "g1/r2"]
     assert found[1:3] == ["nan", "-inf"]

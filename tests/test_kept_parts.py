@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from runs import SCENARIOS, echelon, summary_of
 
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.parts import load, parse
 from echelon.sim.recording import read_metadata, recover

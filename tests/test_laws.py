@@ -13,9 +13,10 @@ from echelon.agents.robot import Robot
 from echelon.controller.laws import Block, Law, Linear
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.law import law_block, make_nu, make_state, make_weight
-from echelon.load import ScenarioError, effective_toml
+from echelon.errors import PartRunError
+from echelon.loading import ScenarioError, effective_toml
 from echelon.plan import Plan
-from echelon.plugins import Part, PartRunError
+from echelon.plugins import Part
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load, parse
 from echelon.sim.results.blocks import block_series

@@ -8,6 +8,7 @@ from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given
 from hypothesis import strategies as st
 
+from echelon.bridge.cyclic import WheelState
 from echelon.bridge.native.codec import (
     LENGTH,
     MAX_ROBOTS,
@@ -18,7 +19,6 @@ from echelon.bridge.native.codec import (
     Refusal,
     Status,
     Torque,
-    WheelState,
     decode_status,
     encode_status,
     frame_id,

@@ -1,6 +1,7 @@
 """The native drive and host: what is special to them; what all protocols share is in tests/conformance."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,9 @@ from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from echelon.bridge.cyclic import WheelState
+from echelon.bridge.cyclic.drive import CAUSE_PERSISTS, FIRST_NOT_ZERO, NOT_CLEARED
+from echelon.bridge.cyclic.frames import REMOTE
 from echelon.bridge.frame import Frame
 from echelon.bridge.motor import Fault
 from echelon.bridge.native.codec import (
@@ -17,11 +21,10 @@ from echelon.bridge.native.codec import (
     Refusal,
     Status,
     Torque,
-    WheelState,
     decode_status,
     encode_status,
 )
-from echelon.bridge.native.drive import CAUSE_PERSISTS, FIRST_NOT_ZERO, NOT_CLEARED, REMOTE, REPEATED, NativeDrive
+from echelon.bridge.native.drive import REPEATED, NativeDrive
 from echelon.bridge.native.host import NativeHost
 from tests.bench_drives import MS, drive_plan
 
@@ -60,7 +63,7 @@ def send() -> Sender:
 
 @pytest.fixture
 def drive() -> NativeDrive:
-    made = NativeDrive(PLAN, ROBOT)
+    made = NativeDrive(PLAN)
     made.advance(0)
     return made
 
@@ -77,7 +80,7 @@ def said(frames: list[Frame]) -> Feedback:
 
 
 def test_feedback_and_status_come_at_their_times() -> None:
-    drive = NativeDrive(PLAN, ROBOT)
+    drive = NativeDrive(PLAN)
     times = []
     for time_ms in range(-3, 250):
         for can_id, _, remote in drive.advance(time_ms * MS):
@@ -228,16 +231,17 @@ def test_power_on_takes_any_counter_and_knows_no_fault(drive: NativeDrive, send:
     drive.mend(2 * WATCHDOG_NS + 3 * MS, 1, Fault.SILENT)
     send.counter -= 1
     drive.receive(2 * WATCHDOG_NS + 4 * MS, send())
-    assert (drive.states, drive.faults, drive.refused) == ([ON, ON], [*FINE], {})
+    assert (drive.states, drive.faults, drive.refused) == ([ON, ON], [None, None], {})
     assert said(drive.advance(2 * WATCHDOG_NS + PERIOD_NS)).torques == (0.0, 0.0)
 
 
 def test_robot_numbers() -> None:
     for make in (NativeDrive, NativeHost):
         with pytest.raises(ValueError, match="127"):
-            make(PLAN, 127)
-    assert NativeDrive(PLAN, 126).identifiers == {0x17E}
-    assert NativeHost(PLAN, 126).identifiers == {0x1FE, 0x27E}
+            make(replace(PLAN, node_ids=(127, 127)))
+    last = replace(PLAN, node_ids=(126, 126))
+    assert NativeDrive(last).identifiers == {0x17E}
+    assert NativeHost(last).identifiers == {0x1FE, 0x27E}
 
 
 Step = tuple[bool, bool, int, int, bool, bool, int]
@@ -256,7 +260,7 @@ causes = st.lists(st.tuples(st.integers(0, 39), st.integers(0, 1), st.booleans()
 @given(steps, causes)
 def test_states_are_those_of_the_table(given_steps: list[Step], given_causes: list[tuple[int, int, bool]]) -> None:
     """Against the rules written as a table of their own, wheel by wheel."""
-    drive, sender, time_ms, heard_ms = NativeDrive(PLAN, ROBOT), Sender(), 0, 0
+    drive, sender, time_ms, heard_ms = NativeDrive(PLAN), Sender(), 0, 0
     states, present, wanted = ["off", "off"], [False, False], [0, 0]
     for number, (enable_right, enable_left, right, left, clear, estop, wait_ms) in enumerate(given_steps):
         time_ms += wait_ms
@@ -318,7 +322,7 @@ WHOLE_FRAMES = (*Refusal, REMOTE, REPEATED)
 
 
 def test_whatever_comes_the_drive_gives_no_torque_unless_enabled() -> None:
-    drive, time_ns, number = NativeDrive(PLAN, ROBOT), 0, 120_000
+    drive, time_ns, number = NativeDrive(PLAN), 0, 120_000
     drive.advance(0)
     random = np.random.default_rng(1)
     seen = set()
@@ -346,7 +350,7 @@ def test_whatever_comes_the_drive_gives_no_torque_unless_enabled() -> None:
 
 
 def test_whatever_comes_the_host_survives_and_counts() -> None:
-    host, number = NativeHost(drive_plan("native", recover_ns=50 * MS), ROBOT), 120_000
+    host, number = NativeHost(drive_plan("native", recover_ns=50 * MS)), 120_000
     others = (0, 0x103, 0x184, 0x7FF)
     # every fourth is a status, now and then a healthy drive's feedback
     feedback, status = random_frames(3, number, FEEDBACK, others), random_frames(4, number // 4, STATUS, others)
@@ -373,7 +377,7 @@ def test_whatever_comes_the_host_survives_and_counts() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans()), max_size=20))
 def test_noise_does_nothing(frames: list[tuple[int, bytes, bool]]) -> None:
-    drive, host, sender = NativeDrive(PLAN, ROBOT), NativeHost(PLAN, ROBOT), Sender()
+    drive, host, sender = NativeDrive(PLAN), NativeHost(PLAN), Sender()
     drive.advance(0)
     drive.receive(0, sender())
     drive.receive(0, sender(0.5, 0.5))
@@ -392,7 +396,7 @@ def feedback_frame(counter: int, states: tuple[WheelState, WheelState], faults: 
 
 
 def test_host_words_for_faults() -> None:
-    host = NativeHost(PLAN, ROBOT)
+    host = NativeHost(PLAN)
     host.receive(0, feedback_frame(0, (ON, ON), FINE))
     assert (host.enabled, host.fault, host.torque, host.torque_ns) == (True, "", (0.5, -0.5), 0)
     host.receive(MS, feedback_frame(1, (FAULT, FAULT), (FaultCode.OVER_TEMPERATURE, FaultCode.WATCHDOG)))
@@ -402,14 +406,14 @@ def test_host_words_for_faults() -> None:
 
 
 def test_host_hears_status() -> None:
-    host = NativeHost(PLAN, ROBOT)
+    host = NativeHost(PLAN)
     host.receive(0, Frame(STATUS, encode_status(Status(ROBOT, (1.0, -2.0), 24.0, 50.0, 0))))
     assert host.status == Status(ROBOT, (1.0, -2.0), 24.0, 50.0, 0)
     assert host.torque_ns is None
 
 
 def test_host_sends_one_command_per_cycle_and_counts_what_does_not_fit() -> None:
-    host = NativeHost(PLAN, ROBOT)
+    host = NativeHost(PLAN)
     host.receive(0, feedback_frame(0, (ON, ON), FINE))
     (frame,) = host.command(0, 100.0, -0.25, saturated=True)
     torque = CODEC.decode(*frame[:2])
@@ -418,7 +422,7 @@ def test_host_sends_one_command_per_cycle_and_counts_what_does_not_fit() -> None
 
 
 def test_host_stops_for_an_emergency(drive: NativeDrive) -> None:
-    host = NativeHost(drive_plan("native", recover_ns=0), ROBOT)
+    host = NativeHost(drive_plan("native", recover_ns=0))
     for time_ns in range(0, 50 * MS, PERIOD_NS):
         for frame in drive.advance(time_ns):
             host.receive(time_ns, frame)
@@ -426,7 +430,7 @@ def test_host_stops_for_an_emergency(drive: NativeDrive) -> None:
         drive.receive(time_ns, *host.command(time_ns, 0.5, 0.5))
     assert torques(drive) == [0.5, 0.5]
     drive.receive(45 * MS, *host.estop(45 * MS))
-    assert (torques(drive), drive.faults) == ([0.0, 0.0], [FaultCode.ESTOP] * 2)
+    assert (torques(drive), drive.faults) == ([0.0, 0.0], [Fault.ESTOP] * 2)
     for time_ns in range(50 * MS, 200 * MS, PERIOD_NS):
         for frame in drive.advance(time_ns):
             host.receive(time_ns, frame)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 
+from echelon.bridge.cyclic import WheelState
 from echelon.bridge.frame import Frame
 from echelon.bridge.motor import LATCHING, Fault
-from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, WheelState, encode_status
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, Status, encode_status
 from echelon.bridge.native.observe import NativeObserver
 from echelon.bridge.observe import Finding
 from tests.bench_drives import ENVELOPE, MS, drive_plan
@@ -30,7 +31,7 @@ class Bus:
     """A bus on which frames are put by hand, with counters that are right."""
 
     def __init__(self) -> None:
-        self.observer = NativeObserver(PLAN, ENVELOPE, ROBOT)
+        self.observer = NativeObserver(PLAN, ENVELOPE)
         self.counters = {COMMAND: 0, FEEDBACK: 0, STATUS: 0}
         self.time_ns = 0
 
@@ -74,7 +75,7 @@ def bus() -> Bus:
 
 def findings(rig: Rig) -> list[Finding]:
     """What is found in all that passed over a rig's bus; of one instant, what drives said came first."""
-    observer = NativeObserver(rig.plan, ENVELOPE, ROBOT)
+    observer = NativeObserver(rig.plan, ENVELOPE)
     frames = sorted(rig.sent + rig.commanded, key=lambda timed: timed[0])
     return [finding for time_ns, frame in frames for finding in observer.observe(time_ns, frame)]
 
@@ -126,7 +127,7 @@ def test_readings(bus: Bus) -> None:
 
 
 def test_what_comes_regularly() -> None:
-    observer = NativeObserver(PLAN, ENVELOPE, ROBOT)
+    observer = NativeObserver(PLAN, ENVELOPE)
     assert observer.cyclic == {COMMAND: 10 * MS, FEEDBACK: 10 * MS, STATUS: 100 * MS}
     assert observer.identifiers == {COMMAND, FEEDBACK, STATUS}
 
@@ -165,7 +166,7 @@ def test_torque_above_the_envelopes(bus: Bus, sign: int) -> None:
 
 
 def test_an_envelope_without_limit() -> None:
-    observer = NativeObserver(PLAN, ENVELOPE.__class__(inf, inf, inf, inf, 1), ROBOT)
+    observer = NativeObserver(PLAN, ENVELOPE.__class__(inf, inf, inf, inf, 1))
     data, _ = CODEC.encode(ROBOT, 32.767, -32.767, 0)
     assert observer.observe(0, Frame(COMMAND, data)) == []
 

@@ -26,7 +26,7 @@ class Robot:
     def __init__(self, start_ns: int = 0, **plan: Any) -> None:
         self.plan = drive_plan("odrive", (1, 2), **plan)
         self.drives = [ODriveDrive(self.plan, wheel) for wheel in (0, 1)]
-        self.host = ODriveHost(self.plan, 7)
+        self.host = ODriveHost(self.plan)
         self.now_ns = start_ns
         self.deaf: set[int] = set()
         """Axes that do not get the host's frames"""
@@ -118,7 +118,7 @@ def test_bring_up(start_ns: int) -> None:
 
 
 def test_without_answers_it_asks_again_every_200_ms() -> None:
-    host = ODriveHost(PLAN, 0)
+    host = ODriveHost(PLAN)
     assert (host.torque, host.torque_ns) == ((0.0, 0.0), None)
     asked = [t for t in range(0, 1000, 10) if host.poll(t * MS)]
     assert asked == [0, 50, 250, 300, 500, 550, 750, 800]
@@ -139,7 +139,7 @@ def test_one_axis_alone_is_not_enough() -> None:
 
 
 def test_the_mean_torque_of_both_is_reported_when_both_have_reported() -> None:
-    host = ODriveHost(PLAN, 0)
+    host = ODriveHost(PLAN)
     host.receive(5, frame(1, "Get_Torques", Torque_Target=9.0, Torque_Estimate=0.5))
     assert (host.torque, host.torque_ns) == ((0.5, 0.0), None)
     host.receive(7, frame(2, "Get_Torques", Torque_Target=9.0, Torque_Estimate=-0.25))
@@ -261,7 +261,7 @@ NOTHING = frame(1, "Get_Torques")
     ],
 )
 def test_an_axis_that_gives_no_torque(cycles: int, report: Frame, fault: str) -> None:
-    host = ODriveHost(PLAN, 0)
+    host = ODriveHost(PLAN)
     host.poll(-50 * MS)
     host.poll(0)
     for axis in (1, 2):
@@ -324,15 +324,15 @@ def test_torques_are_limited_to_the_motors() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_torque_that_is_not_finite_is_a_mistake(bad: float) -> None:
-    for host in (ODriveHost(PLAN, 0), Robot().up().host):
+    for host in (ODriveHost(PLAN), Robot().up().host):
         for torques in ((bad, 0.0), (0.0, bad)):
             with pytest.raises(ValueError, match=f"finite.*{bad!r}"):
                 host.command(0, *torques)
 
 
 def test_two_wheels_are_two_nodes() -> None:
-    with pytest.raises(ValueError, match=r"robot 3 .*\(4, 4\)"):
-        ODriveHost(drive_plan("odrive", (4, 4)), 3)
+    with pytest.raises(ValueError, match=r"two nodes, not \(4, 4\)"):
+        ODriveHost(drive_plan("odrive", (4, 4)))
 
 
 REFUSED: list[tuple[str, Frame]] = [
@@ -350,7 +350,7 @@ REFUSED: list[tuple[str, Frame]] = [
 
 @pytest.mark.parametrize(("reason", "bad"), REFUSED)
 def test_what_is_refused_is_counted_and_is_no_sign_of_life(reason: str, bad: Frame) -> None:
-    host = ODriveHost(PLAN, 0)
+    host = ODriveHost(PLAN)
     host.receive(0, frame(1, "Heartbeat", Axis_State=1))
     host.receive(90 * MS, bad)
     assert host.refused == {reason: 1}
@@ -362,7 +362,7 @@ def test_what_is_refused_is_counted_and_is_no_sign_of_life(reason: str, bad: Fra
 
 def test_whatever_comes_nothing_raises_and_torque_only_while_enabled() -> None:
     dice = random.Random(5)
-    host = ODriveHost(drive_plan("odrive", (1, 2), recover_ns=50 * MS), 0)
+    host = ODriveHost(drive_plan("odrive", (1, 2), recover_ns=50 * MS))
     names = ["Get_Error", "Get_Encoder_Estimates", "Get_Torques"]
     ours = {axis << 5 | command for axis in (1, 2) for command in (1, 3, 9, 28)}
     floats = {axis << 5 | command for axis in (1, 2) for command in (9, 28)}

@@ -28,7 +28,7 @@ QUIET = ODriveConfig(heartbeat_msg_rate_ms=0)
 
 
 def make_observer(config: ODriveConfig | None = None) -> ODriveObserver:
-    return ODriveObserver(PLAN, ENVELOPE, 0, config)
+    return ODriveObserver(PLAN, ENVELOPE, config)
 
 
 def kinds(found: list[Finding]) -> list[str]:
@@ -52,7 +52,7 @@ def commanded(torque: float, axis: int = 1) -> Frame:
 def test_a_whole_life_has_nothing_wrong(fault: Fault | None) -> None:
     """Bring-up, torque, a fault, recovery, stop and start."""
     drives = [ODriveDrive(PLAN, wheel) for wheel in (0, 1)]
-    host, observer = ODriveHost(PLAN, 0), make_observer()
+    host, observer = ODriveHost(PLAN), make_observer()
     found: list[Finding] = []
 
     def pass_on(time_ns: int, sent: Frame) -> None:
@@ -159,7 +159,7 @@ def test_a_good_frame(good: Frame) -> None:
 
 
 def test_a_limit_that_no_float_is() -> None:
-    observer = ODriveObserver(PLAN, replace(ENVELOPE, torque_limit=1.1), 0)
+    observer = ODriveObserver(PLAN, replace(ENVELOPE, torque_limit=1.1))
     rounded = struct.unpack("<f", struct.pack("<f", 1.1))[0]
     assert rounded > 1.1
     assert observer.observe(0, commanded(1.1)) == []

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_shapes import variables
 
-from echelon.load import ScenarioError
+from echelon.loading import ScenarioError
 from echelon.members import MAX_ROBOTS, nanoseconds
 from echelon.messages import Channel
 from echelon.plan import Plan, PlanError
@@ -147,7 +147,8 @@ def test_what_cannot_be_steered_is_refused():
     assert refusal(grouped(2), "robot.offset=0").startswith("formation.groups.g1.robots.r0.offset = 0: must not be")
     assert (
         refusal(grouped(2), "robot.inertia=0.4")
-        == "formation.groups.g1.robots.r0.inertia = 0.4: must be larger than mass·offset² = 0.4"
+        == "formation.groups.g1.robots.r0.inertia = 0.4: must be larger than mass·offset² = 0.4; "
+        "the same holds for 1 more"
     )
     assert "inertia = 0.5: must be larger" in refusal(grouped(2), "robot.offset=1e300")
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from runs import SCENARIOS
 
-import echelon.load
+import echelon.loading
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.trajectory import make_trajectory
-from echelon.load import ScenarioError
+from echelon.errors import PartRunError
+from echelon.loading import ScenarioError
 from echelon.plan import Plan
-from echelon.plugins import PartRunError
 from echelon.sim.engine import Engine
 from echelon.sim.parts import REGISTRY, load
 
@@ -31,7 +31,7 @@ class Spiral(Trajectory):
                          [-2 * w * s - w * w * t * c, 2 * w * c - w * w * t * s]])
 """
 PLANT = """
-import echelon.load
+import echelon.loading
 from echelon.agents.plant import Plant, paper_step
 
 class Sticky(Plant):
@@ -57,7 +57,7 @@ def folder(tmp_path: Path) -> Path:
 
 def untried(folder: Path, *overrides: str) -> Plan:
     """Returns a plan whose parts have not been tried (echelon.sim.probe)."""
-    return echelon.load.load(folder / "mine.toml", overrides, REGISTRY)[1]
+    return echelon.loading.load(folder / "mine.toml", overrides, REGISTRY)[1]
 
 
 def refused(folder: Path, *overrides: str) -> str:

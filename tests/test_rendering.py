@@ -14,9 +14,7 @@ PUBLISHED = ROOT / "docs" / "summary.schema.json"
 
 
 def test_what_is_published_is_up_to_date() -> None:
-    assert json.loads(PUBLISHED.read_text(encoding="utf-8")) == summary_schema(), (
-        "write it anew: python -m echelon.sim.results.rendering > docs/summary.schema.json"
-    )
+    assert json.loads(PUBLISHED.read_text(encoding="utf-8")) == summary_schema(), "make docs"
 
 
 def test_every_record_is_described() -> None:

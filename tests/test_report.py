@@ -20,7 +20,7 @@ from echelon.bridge.reports import (
     ScheduledEvent,
     WheelsReport,
 )
-from echelon.load import effective_toml
+from echelon.loading import effective_toml
 from echelon.sim.drawing import COLUMNS, thin
 from echelon.sim.report import RunForReport, write_report
 from echelon.sim.results.summary import summarise

@@ -1,6 +1,7 @@
 """A run's processes come up together, give what one process gives, and go down together, however they end."""
 
 import os
+import re
 import resource
 import signal
 from collections.abc import Iterator
@@ -14,12 +15,22 @@ from runs import descendants, kill_session, pid_of, plan_of, session_members, st
 
 from echelon.plan import Plan
 from echelon.sim.contract import ProcessSpec
+from echelon.sim.parts import parse
 from echelon.sim.recording import read_trace, recover
-from echelon.sim.supervisor import Outcome, Progress, Supervisor
+from echelon.sim.supervisor import NAMED, Outcome, Progress, Supervisor, few
 
 LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
 LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0},{channel="reference",loss=1.0}]'
 SHORT = "duration=0.3"
+TWENTY = """
+name = "twenty"
+duration = 1000.0
+robot = {{ mass = 4.0, inertia = 0.12, wheel_radius = 0.05, arm = 0.15, offset = 0.1 }}
+law = {{ epsilon = [0.5] }}
+trajectory = {{ kind = "line", velocity = [0.1, 0.0] }}
+formation.shape = {{ kind = "line", spacing = 1.0 }}
+formation.robots = {{ {robots} }}
+"""
 
 
 def supervised(plan: Plan, folder: Path, **options: object) -> Outcome:
@@ -246,3 +257,36 @@ def test_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
     assert code == 3
     assert "the recording failed" in err
     assert recover(tmp_path / "run" / "run.mcap", tmp_path / "mended.mcap").messages > 1000
+
+
+def test_a_note_names_a_dozen_processes_at_most() -> None:
+    names = [f"r{number}" for number in range(127)]
+    assert few(names[:3]) == "r0, r1, r2"
+    assert few(names[:NAMED]) == ", ".join(names[:12])
+    assert few(names, "; ") == "; ".join([*names[:12], "and 115 more"])
+
+
+def test_a_run_of_many_that_stalls_says_so_in_a_short_line(tmp_path: Path) -> None:
+    """Twenty robots stop, and their leader waits for all of them."""
+    robots = ", ".join(f"r{number} = {{ start = [{number}.0, 0.0] }}" for number in range(20))
+    text = TWENTY.format(robots=robots)
+    plan = parse(text, "t.toml")[1]
+    notes: list[str] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.note:
+            notes.append(progress.note)
+        elif progress.messages > 200:
+            for pid in stoppable():
+                os.kill(pid, signal.SIGSTOP)
+
+    def stoppable() -> list[int]:
+        named = {pid: Path(f"/proc/{pid}/comm").read_text().strip() for pid in descendants(os.getpid())}
+        return [pid for pid, name in named.items() if re.fullmatch(r"r\d+", name)]
+
+    outcome = supervised(plan, tmp_path, show=watch, stall_timeout_s=5.0)
+    (note,) = {note for note in notes if note.startswith("stalled")}
+    assert note.count("(process ") == NAMED
+    assert note.endswith(", and 8 more")
+    assert outcome.failure is not None
+    assert len(outcome.failure.splitlines()[0]) < 800

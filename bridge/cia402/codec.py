@@ -33,6 +33,8 @@ RPDO_IDS = (0x200, 0x300, 0x400, 0x500)
 SDO_ANSWER_ID = 0x580
 SDO_REQUEST_ID = 0x600
 HEARTBEAT_ID = 0x700
+NODE_IDS = (EMCY_ID, *TPDO_IDS, *RPDO_IDS, SDO_ANSWER_ID, SDO_REQUEST_ID, HEARTBEAT_ID)
+"""What identifiers of a node begin with."""
 MAX_NODE = 126
 HOST_NODE = 127
 """The node that the host's heartbeat is of; the drives' nodes are 1 .. 126."""

@@ -1,40 +1,42 @@
 """The CANopen frames of a robot's drives for `echelon dbc`, with the PDOs as its host maps them.  Pure."""
 
 import re
-from collections import OrderedDict
-from collections.abc import Iterable, Mapping
-from enum import IntEnum
 from math import ceil
 
 from cantools.database.can import Message, Signal
-from cantools.database.conversion import BaseConversion
-from cantools.database.namedsignalvalue import NamedSignalValue
 
 from echelon.bridge.cia402.codec import (
     EMCY,
     EMCY_ID,
     HEARTBEAT_ID,
+    HOST_NODE,
     MODE_CYCLIC_TORQUE,
     MODE_NONE,
     MODE_PROFILE_TORQUE,
+    NMT_ID,
     RPDO1,
     RPDO2,
     RPDO_IDS,
+    SDO_ANSWER_ID,
+    SDO_REQUEST_ID,
+    SYNC_ID,
     TPDO1,
     TPDO2,
     TPDO3,
     TPDO_IDS,
     ErrorCode,
     Nmt,
+    NmtCommand,
     rated_mnm,
 )
 from echelon.bridge.cia402.configuration import heartbeat_ns
+from echelon.bridge.cia402.sdo import LENGTH
+from echelon.bridge.dbc import BRIDGE, flags, names, number
 from echelon.bridge.frame import WHEELS
 from echelon.can_plan import DrivePlan
 
-Choices = OrderedDict[int, str | NamedSignalValue]
-HOST = "bridge"
-"""Who commands."""
+DRIVES = "drives"
+"""Who hears what is for all drives on a bus."""
 CONTROLWORD_BITS = {
     0: "switch_on",
     1: "enable_voltage",
@@ -58,6 +60,7 @@ STATUSWORD_BITS = {
     12: "follows_command",
 }
 _MODES = {MODE_NONE: "none", MODE_PROFILE_TORQUE: "profile torque", MODE_CYCLIC_TORQUE: "cyclic synchronous torque"}
+_COMMANDS = (*RPDO_IDS, SDO_REQUEST_ID)
 
 
 def messages(plan: DrivePlan, robot_name: str) -> list[Message]:
@@ -70,15 +73,14 @@ def messages(plan: DrivePlan, robot_name: str) -> list[Message]:
     found = []
     for node, wheel in zip(plan.node_ids, WHEELS, strict=True):
         drive = f"drive_{robot}_{wheel}"
-        modes = _choices(_MODES)
-        control = [*_flags(CONTROLWORD_BITS, drive), _number("mode", 16, 8, drive, choices=modes)]
-        target = [_number("target_torque", 0, 16, drive, torque, "Nm")]
-        status = [*_flags(STATUSWORD_BITS, HOST), _number("mode", 16, 8, HOST, choices=modes)]
-        motion = [_number("position", 0, 32, HOST, turn, "rev"), _number("torque", 32, 16, HOST, torque, "Nm")]
-        velocity = [_number("velocity", 0, 32, HOST, turn, "rev/s")]
-        code = _number("error_code", 0, 16, HOST, signed=False, choices=_choices(_names(ErrorCode)))
-        error = [code, _number("error_register", 16, 8, HOST, signed=False)]
-        beat = [_number("state", 0, 8, HOST, signed=False, choices=_choices(_names(Nmt)))]
+        control = [*flags(CONTROLWORD_BITS, drive), number("mode", 16, 8, drive, choices=_MODES)]
+        target = [number("target_torque", 0, 16, drive, torque, "Nm")]
+        status = [*flags(STATUSWORD_BITS, BRIDGE), number("mode", 16, 8, BRIDGE, choices=_MODES)]
+        motion = [number("position", 0, 32, BRIDGE, turn, "rev"), number("torque", 32, 16, BRIDGE, torque, "Nm")]
+        velocity = [number("velocity", 0, 32, BRIDGE, turn, "rev/s")]
+        code = number("error_code", 0, 16, BRIDGE, signed=False, choices=names(ErrorCode))
+        error = [code, number("error_register", 16, 8, BRIDGE, signed=False)]
+        beat = [number("state", 0, 8, BRIDGE, signed=False, choices=names(Nmt))]
         for kind, base, length, signals, every_ns in (
             ("RPDO1", RPDO_IDS[0], RPDO1.size, control, None),
             ("RPDO2", RPDO_IDS[1], RPDO2.size, target, period_ns),
@@ -86,6 +88,8 @@ def messages(plan: DrivePlan, robot_name: str) -> list[Message]:
             ("TPDO2", TPDO_IDS[1], TPDO2.size, motion, period_ns),
             ("TPDO3", TPDO_IDS[2], TPDO3.size, velocity, period_ns),
             ("EMCY", EMCY_ID, EMCY.size, error, None),
+            ("SDO_request", SDO_REQUEST_ID, LENGTH, _sdo(drive), None),
+            ("SDO_answer", SDO_ANSWER_ID, LENGTH, _sdo(BRIDGE), None),
             ("heartbeat", HEARTBEAT_ID, 1, beat, beat_ns),
         ):
             found.append(
@@ -94,34 +98,27 @@ def messages(plan: DrivePlan, robot_name: str) -> list[Message]:
                     f"{robot}_{wheel}_{kind}",
                     length,
                     signals,
-                    senders=[HOST if base in RPDO_IDS else drive],
+                    senders=[BRIDGE if base in _COMMANDS else drive],
                     cycle_time=None if every_ns is None else ceil(every_ns / 1_000_000),
                 )
             )
     return found
 
 
-def _number(
-    name: str,
-    start: int,
-    bits: int,
-    receiver: str,
-    scale: float = 1,
-    unit: str | None = None,
-    signed: bool = True,
-    choices: Choices | None = None,
-) -> Signal:
-    conversion = BaseConversion.factory(scale=scale, choices=choices)
-    return Signal(name, start, bits, receivers=[receiver], is_signed=signed, conversion=conversion, unit=unit)
+def shared_messages(period_ns: int, watchdog_ns: int) -> list[Message]:
+    """Returns what the host sends for all drives on a bus."""
+    command = number("command", 0, 8, DRIVES, signed=False, choices=names(NmtCommand))
+    node = number("node", 8, 8, DRIVES, signed=False, choices={0: "all"})
+    beat = number("state", 0, 8, DRIVES, signed=False, choices=names(Nmt))
+    beat_ms = ceil(heartbeat_ns(period_ns, watchdog_ns) / 1_000_000)
+    return [
+        Message(NMT_ID, "NMT", 2, [command, node], senders=[BRIDGE]),
+        Message(SYNC_ID, "SYNC", 0, [], senders=[BRIDGE], cycle_time=ceil(period_ns / 1_000_000)),
+        Message(HEARTBEAT_ID + HOST_NODE, "bridge_heartbeat", 1, [beat], senders=[BRIDGE], cycle_time=beat_ms),
+    ]
 
 
-def _flags(names: Mapping[int, str], receiver: str) -> list[Signal]:
-    return [_number(name, bit, 1, receiver, signed=False) for bit, name in names.items()]
-
-
-def _choices(names: Mapping[int, str]) -> Choices:
-    return OrderedDict(names)
-
-
-def _names(kinds: Iterable[IntEnum]) -> dict[int, str]:
-    return {kind.value: kind.name.lower().replace("_", " ") for kind in kinds}
+def _sdo(receiver: str) -> list[Signal]:
+    """Returns the bytes of an SDO as all but segments have them."""
+    fields = (("command", 0, 8), ("index", 8, 16), ("subindex", 24, 8), ("data", 32, 32))
+    return [number(name, start, bits, receiver, signed=False) for name, start, bits in fields]

@@ -47,14 +47,14 @@ class Master:
 
 
 class Cia402Host:
-    """Commands both drives of robot number `robot`.  Raises ValueError for bad node ids, or twice the same."""
+    """Commands both drives of a robot.  Raises ValueError for bad node ids, or twice the same."""
 
-    def __init__(self, plan: DrivePlan, robot: int) -> None:
+    def __init__(self, plan: DrivePlan) -> None:
         if plan.node_ids[0] == plan.node_ids[1]:
             raise ValueError(f"each wheel needs a node id of its own, not twice {plan.node_ids[0]}")
         self.plan = plan
-        self.robot = robot
         self.refused: Counter[str] = Counter()
+        self.clipped = 0
         self._wheels = (Wheel(plan, 0), Wheel(plan, 1))
         bases = (EMCY_ID, *TPDO_IDS[:3], SDO_ANSWER_ID, HEARTBEAT_ID)
         self._listeners = {base + wheel.node: (wheel, base) for wheel in self._wheels for base in bases}
@@ -131,6 +131,11 @@ class Cia402Host:
         self._started = True
         for wheel in self._wheels:
             wheel.recover()
+
+    def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
+        """Returns the target torques [N m], finite ones, whatever the drives say."""
+        torques = (tau_right, tau_left) if enable else (0.0, 0.0)
+        return [wheel.target(torque) for wheel, torque in zip(self._wheels, torques, strict=True)]
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""

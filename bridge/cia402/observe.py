@@ -67,7 +67,7 @@ class _Drive:
 
 
 class Cia402Observer:
-    """Listens to the frames of robot number `robot`.  Kinds of findings:
+    """Listens to the frames of one robot.  Kinds of findings:
 
     `remote`, `length`, `heartbeat`, `statusword`: no frame of the protocol; `torque above limit`: commanded, beyond the
     envelope's by more than half a bit; `transition`: a state to which no transition leads from the last one, with the
@@ -80,8 +80,7 @@ class Cia402Observer:
     is what `WheelReading.fault` tells.
     """
 
-    def __init__(self, plan: DrivePlan, envelope: EnvelopePlan, robot: int) -> None:
-        self.robot = robot
+    def __init__(self, plan: DrivePlan, envelope: EnvelopePlan) -> None:
         self._plan = plan
         self._rated = rated_mnm(plan.motor.rated_torque)
         self._limit = envelope.torque_limit + 0.500001 * newton_metres(1, self._rated)

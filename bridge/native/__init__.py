@@ -1,1 +1,54 @@
 """The native protocol: both wheels of a robot in one frame, with counter and CRC."""
+
+from typing import TYPE_CHECKING, ClassVar
+
+from echelon.bridge.frame import Drive, Host
+from echelon.bridge.observe import Observer
+from echelon.bridge.protocol import DriveProtocol
+from echelon.can_plan import DrivePlan, EnvelopePlan
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+
+class Native(DriveProtocol):
+    """One drive for both wheels of a robot, with identifiers that are a base plus the robot's number (bridge.native.codec)."""
+
+    wheels: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1),)
+    nodes: ClassVar[range] = range(127)
+    by_number: ClassVar[bool] = True
+
+    def identifiers(self, node: int) -> frozenset[int]:
+        """Returns the identifiers of command, feedback and status."""
+        from echelon.bridge.native.codec import BASE_ID, FEEDBACK_ID, STATUS_ID
+
+        return frozenset(base + node for base in (BASE_ID, FEEDBACK_ID, STATUS_ID))
+
+    def place(self, drive: DrivePlan) -> str:
+        """Returns the identifiers, for there is no node id to be seen on the bus."""
+        command, feedback, status = sorted(self.identifiers(drive.node_ids[0]))
+        return f"command {command:#05x}, feedback {feedback:#05x}, status {status:#05x}"
+
+    def host(self, drive: DrivePlan) -> Host:
+        """Returns what commands a robot's drive."""
+        from echelon.bridge.native.host import NativeHost
+
+        return NativeHost(drive)
+
+    def drive(self, drive: DrivePlan, number: int) -> Drive:
+        """Returns the virtual drive of both wheels."""
+        from echelon.bridge.native.drive import NativeDrive
+
+        return NativeDrive(drive)
+
+    def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
+        """Returns what listens to a robot's frames."""
+        from echelon.bridge.native.observe import NativeObserver
+
+        return NativeObserver(drive, envelope)
+
+    def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
+        """Returns command, feedback and status."""
+        from echelon.bridge.native.dbc import messages
+
+        return messages(drive, name)

@@ -44,6 +44,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
+from echelon.bridge.cyclic import WheelState
 from echelon.bridge.native.counter import COUNTERS
 from echelon.bridge.native.crc import crc8
 
@@ -89,14 +90,6 @@ class Refusal(StrEnum):
     LENGTH = "length"
     CRC = "crc"
     VALUE = "value"
-
-
-class WheelState(IntEnum):
-    """What a wheel's drive does."""
-
-    DISABLED = 0
-    ENABLED = 1
-    FAULT = 2
 
 
 class FaultCode(IntEnum):

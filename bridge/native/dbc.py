@@ -2,12 +2,13 @@
 
 import math
 from collections import OrderedDict
-from typing import Final
 
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
+from echelon.bridge.cyclic import WheelState
+from echelon.bridge.dbc import BRIDGE
 from echelon.bridge.native.codec import (
     BASE_ID,
     CLEAR,
@@ -26,21 +27,17 @@ from echelon.bridge.native.codec import (
     VOLTAGE_SCALE,
     FaultCode,
     NativeCodec,
-    WheelState,
     frame_id,
 )
 from echelon.can_plan import DrivePlan
 
-BRIDGE: Final = "bridge"
-"""Who sends commands and takes feedback."""
-KINDS: Final = ("torque", "feedback", "status")
-"""What the names of the messages begin with."""
 
-
-def messages(plan: DrivePlan, name: str, number: int) -> list[Message]:
-    """The command, feedback and status of robot number `number`; `name` is an identifier of 23 characters at most.
+def messages(plan: DrivePlan, name: str) -> list[Message]:
+    """Returns command, feedback and status of the robot whose number is the plan's node id; `name` is an identifier of up to 23
+    characters.
 
     Raises ValueError for a torque scale that is not positive and finite, or a number out of range."""
+    number = plan.node_ids[0]
     scale = NativeCodec(plan.torque_scale).scale  # which checks it
     drive = f"drive_{name}"
 
@@ -106,9 +103,9 @@ def messages(plan: DrivePlan, name: str, number: int) -> list[Message]:
         *ends(BRIDGE),
     ]
     return [
-        message(BASE_ID, KINDS[0], command, f"wheel torques of {name}, one frame per acceleration period", BRIDGE),
-        message(FEEDBACK_ID, KINDS[1], feedback, f"what the wheels of {name} do, one frame per period", drive),
-        message(STATUS_ID, KINDS[2], status, f"how the drive of {name} is", drive, STATUS_EVERY),
+        message(BASE_ID, "torque", command, f"wheel torques of {name}, one frame per acceleration period", BRIDGE),
+        message(FEEDBACK_ID, "feedback", feedback, f"what the wheels of {name} do, one frame per period", drive),
+        message(STATUS_ID, "status", status, f"how the drive of {name} is", drive, STATUS_EVERY),
     ]
 
 

@@ -7,15 +7,13 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
+from echelon.bridge.dbc import BRIDGE
 from echelon.bridge.frame import WHEELS
 from echelon.bridge.odrive.codec import MESSAGES, frame_id
 from echelon.bridge.odrive.codec import Message as Layout
 from echelon.bridge.odrive.config import ODriveConfig
 from echelon.bridge.odrive.enums import Command
 from echelon.can_plan import DrivePlan
-
-HOST = "bridge"
-"""Who sends commands"""
 
 
 def messages(plan: DrivePlan, robot_name: str, config: ODriveConfig | None = None) -> list[Message]:
@@ -34,8 +32,8 @@ def messages(plan: DrivePlan, robot_name: str, config: ODriveConfig | None = Non
                     frame_id(node, command),
                     f"{robot}_{wheel}_{layout.name}",
                     layout.length,
-                    _signals(layout, HOST if layout.reported else drive),
-                    senders=[drive if layout.reported else HOST],
+                    _signals(layout, BRIDGE if layout.reported else drive),
+                    senders=[drive if layout.reported else BRIDGE],
                     cycle_time=None if period_ns is None else -(-period_ns // 1_000_000),
                 )
             )

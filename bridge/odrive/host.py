@@ -83,14 +83,14 @@ class _Axis:
 
 
 class ODriveHost:
-    """Commands the axes of one robot, number `robot`.  Raises ValueError if both have the same node."""
+    """Commands the axes of one robot.  Raises ValueError if both have the same node."""
 
-    def __init__(self, plan: DrivePlan, robot: int) -> None:
+    def __init__(self, plan: DrivePlan) -> None:
         if plan.node_ids[0] == plan.node_ids[1]:
-            raise ValueError(f"the wheels of robot {robot} must be two nodes, not {plan.node_ids!r}")
+            raise ValueError(f"the wheels of a robot must be two nodes, not {plan.node_ids!r}")
         self.plan = plan
-        self.robot = robot
         self.refused: Counter[str] = Counter()
+        self.clipped = 0
         self._axes = tuple(_Axis(node) for node in plan.node_ids)
         self._by_id = {frame_id(axis.node, command): (axis, command) for axis in self._axes for command in _HEARD}
         self._identifiers = frozenset(self._by_id)
@@ -209,6 +209,11 @@ class ODriveHost:
             self._heartbeat(axis, time_ns, values[0], values[1])
         elif command is Command.GET_ERROR and values[0]:
             self._error(axis, time_ns, values[0])
+
+    def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
+        """Returns the frames for wheel torques [N m], finite ones, whatever the axes say."""
+        torques = (tau_right, tau_left) if enable else (0.0, 0.0)
+        return [Frame(can_id, _TORQUE.encode(torque)) for can_id, torque in zip(self._torque_ids, torques, strict=True)]
 
     def _halt_frame(self, axis: _Axis) -> Frame:
         return axis.send(Command.ESTOP) if self._halts is Command.ESTOP else axis.send(self._halts, AxisState.IDLE)

@@ -38,12 +38,11 @@ class _Axis:
 
 
 class ODriveObserver:
-    """Listens to one robot, number `robot`; `config` is what its axes are set up with."""
+    """Listens to one robot; `config` is what its axes are set up with."""
 
-    def __init__(self, plan: DrivePlan, envelope: EnvelopePlan, robot: int, config: ODriveConfig | None = None) -> None:
+    def __init__(self, plan: DrivePlan, envelope: EnvelopePlan, config: ODriveConfig | None = None) -> None:
         self.plan = plan
         self.envelope = envelope
-        self.robot = robot
         self._axes = (_Axis(), _Axis())
         self.wheels = (self._axes[0].wheel, self._axes[1].wheel)
         self._by_id = {

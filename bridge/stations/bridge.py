@@ -29,7 +29,9 @@ class Bridge(ABC):
 
     @abstractmethod
     def stop(self) -> None:
-        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends."""
+        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends.
+
+        After that it raises PartRunError if a protocol that others wrote failed at it."""
 
     def interrupt(self) -> None:  # noqa: B027  most bridges wait for no bus
         """Waits no more for a bus that takes no frames.  To be called, in any thread, when the run breaks off."""

@@ -11,11 +11,12 @@ from echelon.bridge.buses import bus_report, scheduled
 from echelon.bridge.canlog import CanLog
 from echelon.bridge.commander import Commander
 from echelon.bridge.fit import plan_fit
-from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, frames_of
+from echelon.bridge.frame_message import TimedFrame, frames_of
 from echelon.bridge.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.reports import BridgeProgress, CanReport, WheelsReport, stopped_text
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.rail import Rail, on_bus
+from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
 from echelon.plan import Plan
 from echelon.role import Stage
@@ -73,16 +74,15 @@ class ClosedBridge(Bridge):
         self.stop_at(self.role.next_ns)
 
     def stop_at(self, time_ns: int) -> None:
-        """Stops at an instant of run time: at once, and past the models of buses that are as slow as real ones."""
+        """Stops at an instant of run time: at once, and past the models of buses that are as slow as real ones.  After that it
+        raises PartRunError if a protocol that others wrote failed at it."""
         self._robots = self.role.reports()
-        frames = [
-            TimedFrame(time_ns, robot.robot.drive.bus, BRIDGE_NODE, frame)
-            for robot in self.role.robots
-            for frame in robot.host.stop(time_ns)
-        ]
+        frames, failure = self.role.stop(time_ns)
         for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
             self.buses[bus].send(can_id, data, time_ns, remote)
         self.log(frames)
+        if failure:
+            raise PartRunError(failure)
 
     def interrupt(self) -> None:
         """Waits no more for a bus that takes no frames."""

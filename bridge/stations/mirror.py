@@ -15,7 +15,7 @@ from echelon.bridge.canlog import CanLog
 from echelon.bridge.fit import plan_fit
 from echelon.bridge.frame_message import BRIDGE_NODE, add_words
 from echelon.bridge.plan_dbc import dbc_names, plan_dbc
-from echelon.bridge.protocols import torque_frames
+from echelon.bridge.protocols import make_host
 from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped_text
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.torque_mirror import TorqueMirror
@@ -33,11 +33,9 @@ class MirrorBridge(Bridge):
     def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
         self._plan = plan
         self._mirror = TorqueMirror(
-            [robot.path for robot in plan.robots],
-            plan.can.torque_scale,
+            [make_host(robot) for robot in plan.robots],
             [robot.period_ns for robot in plan.robots],
             [robot.envelope for robot in plan.robots],
-            {robot.index: torque_frames(robot) for robot in plan.robots if robot.drive.protocol != "native"},
         )
         self._buses = [open_bus(url) for url in urls]
         self.url = ", ".join(bus.url for bus in self._buses)
@@ -69,7 +67,7 @@ class MirrorBridge(Bridge):
                 time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
             )
             number = self._bus_of[source]
-            for identifier, data in frames:
+            for identifier, data, _ in frames:
                 buses[number].send(identifier, data, time_ns)
                 log.write(time_ns, identifier, data, wall_ns, names[number])
                 add_words(words, time_ns, number, BRIDGE_NODE, identifier, data)
@@ -121,7 +119,9 @@ class MirrorBridge(Bridge):
             dropped=sum(bus.counts.dropped for bus in self._buses),
             log_lost=self._log.counts.lost,
             log_error=str(self._log.error) if self._log.error else None,
-            robots={robot.name: self._mirror.report(robot.index, robot.drive.protocol) for robot in self._plan.robots},
+            robots={
+                robot.name: self._mirror.report(robot.index, robot.drive.protocol.use) for robot in self._plan.robots
+            },
             messages=self._sequence,
         )
 

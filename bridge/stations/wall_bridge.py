@@ -197,9 +197,11 @@ class WallBridge(Bridge):
     def stop(self) -> None:
         """Takes the torque away from all wheels and disables their drives."""
         now_ns = self.clock.now()
-        self._frames_from_buses(now_ns)
-        self._flush()
-        self._closed.stop_at(now_ns)
+        try:
+            self._frames_from_buses(now_ns)
+            self._flush()
+        finally:
+            self._closed.stop_at(now_ns)
 
     def close(self) -> None:
         """Closes log and buses."""

@@ -16,8 +16,9 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from echelon.errors import PartRunError
 from echelon.plan import Array, BlockPlan, Plan
-from echelon.plugins import Part, PartRunError, Plugin
+from echelon.plugins import Part, Plugin
 
 
 @dataclass(frozen=True, slots=True, eq=False)

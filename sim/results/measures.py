@@ -163,12 +163,14 @@ def torque_result(trace: Trace, robot: int) -> TorqueResult:
         right, left = _mean(fields["tau_right_square"]), _mean(fields["tau_left_square"])
         share = _mean(saturated) / (plan.period_ns // plan.torque_period_ns)
         late = float(saturated[times_ns > STARTED_NS].sum())
+    with np.errstate(all="ignore"):
+        rms, rms_right, rms_left = (_finite(np.sqrt(square)) for square in ((right + left) / 2, right, left))
     return TorqueResult(
         robot=plan.name,
         torque_limit=_finite(plan.torque_limit),
-        rms=_finite(((right + left) / 2) ** 0.5),
-        rms_right=_finite(right**0.5),
-        rms_left=_finite(left**0.5),
+        rms=rms,
+        rms_right=rms_right,
+        rms_left=rms_left,
         peak=_finite(peak),
         peak_wheel=peak_wheel,
         peak_time=peak_time,

@@ -46,9 +46,7 @@ def read_summary(path: Path) -> Summary:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
-        raise ValueError(
-            f"{path.name} is no summary that can be read: {where + ': ' if where else ''}{first['msg']}"
-        ) from None
+        raise ValueError(f"is no summary that can be read: {where + ': ' if where else ''}{first['msg']}") from None
     return summary
 
 
@@ -89,7 +87,3 @@ def _describe(table: dict[str, Any], record: type) -> None:
         match statement, following:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                 table["properties"][name]["description"] = inspect.cleandoc(text)
-
-
-if __name__ == "__main__":
-    print(json.dumps(summary_schema(), indent=2, ensure_ascii=False))

@@ -1,7 +1,7 @@
 """What every drive and host must do, whatever their protocol says on the wire.
 
-To add a protocol: an entry in `PROTOCOLS`.  The tests see a robot's drives and host only through `bridge.frame`, and
-count what arrives, not what it looks like.
+To add a protocol: an entry in `PROTOCOLS`.  The tests see a robot's drives and host only through `bridge.frame` and
+`bridge.protocol`, and count what arrives, not what it looks like.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -13,15 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon.bridge.cia402.codec import HOST_NODE, SYNC_ID, Nmt, heartbeat
-from echelon.bridge.cia402.drive import Cia402Drive
-from echelon.bridge.cia402.host import Cia402Host
 from echelon.bridge.frame import Drive, Frame, Host
 from echelon.bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
-from echelon.bridge.native.drive import NativeDrive
-from echelon.bridge.native.host import NativeHost
-from echelon.bridge.odrive.drive import ODriveDrive
-from echelon.bridge.odrive.host import ODriveHost
+from echelon.bridge.protocol import DriveProtocol
 from echelon.can_plan import DrivePlan
 from tests.bench_drives import MS, drive_plan, motor_plan
 
@@ -32,45 +26,19 @@ CYCLES = 60
 """A few tens: by then a host must have its drives enabled."""
 NOTICE: Final = 15
 """Cycles in which a fault must have shown: some drives tell their state every 100 ms"""
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """How to make a robot's drives and host, and what tests must know of them."""
-
-    make: Callable[[DrivePlan], tuple[Sequence[Drive], Host]]
-    resolution: Callable[[DrivePlan], float]
-    """Half a bit of commanded plus half a bit of reported torque [N m]"""
-    beginning: Callable[[DrivePlan, int], list[Frame]] = lambda plan, time_ns: []
-    """What else is on the bus at the beginning of every cycle, before the host's frames: SYNC, a heartbeat"""
-    feeds: Callable[[Frame], bool] = lambda frame: True
-    """True for a frame of the host that feeds a drive's watchdog"""
-
-
-PROTOCOLS = {
-    "native": Protocol(
-        make=lambda plan: ([NativeDrive(plan, 3)], NativeHost(plan, 3)),
-        resolution=lambda plan: plan.torque_scale,
-    ),
-    "odrive": Protocol(
-        make=lambda plan: ([ODriveDrive(plan, wheel) for wheel in WHEELS], ODriveHost(plan, 3)),
-        resolution=lambda plan: 1e-6,
-        feeds=lambda frame: frame.can_id & 31 in (0x07, 0x0E),  # Set_Axis_State, Set_Input_Torque
-    ),
-    "cia402": Protocol(
-        make=lambda plan: ([Cia402Drive(plan, wheel) for wheel in WHEELS], Cia402Host(plan, 3)),
-        resolution=lambda plan: plan.motor.rated_torque * 1e-3,
-        beginning=lambda plan, time_ns: [heartbeat(HOST_NODE, Nmt.OPERATIONAL), Frame(SYNC_ID)],
-        feeds=lambda frame: frame.can_id & 0x780 == 0x300,  # RPDO2
-    ),
+PROTOCOLS: dict[str, Callable[[Frame], bool]] = {
+    "native": lambda frame: frame.data[4] & 32 != 0,
+    "odrive": lambda frame: frame.can_id & 31 == 2,
+    "cia402": lambda frame: frame.can_id & 0x780 == 0x200 and frame.data[:2] == b"\x02\x00",
+    "my_drive.py:MyProtocol": lambda frame: frame.data[4] & 4 != 0,
 }
+"""By what a scenario says of them; and whether a frame of the host is an emergency stop"""
 
 
 @dataclass
 class Rig:
     """A robot's drives and host on a bus without delay, and what passed over it."""
 
-    protocol: Protocol
     plan: DrivePlan
     time_ns: int = -200 * MS
     sent: list[tuple[int, Frame]] = field(default_factory=list)
@@ -81,7 +49,29 @@ class Rig:
     """Nothing of the host reaches the drives"""
 
     def __post_init__(self) -> None:
-        self.drives, self.host = self.protocol.make(self.plan)
+        self.drives = make_drives(self.plan)
+        self.host = self.new_host()
+        self.master = self.protocol.master(self.plan.period_ns, self.plan.watchdog_ns)
+
+    @property
+    def protocol(self) -> DriveProtocol:
+        made: DriveProtocol = self.plan.protocol.made
+        return made
+
+    @property
+    def resolution(self) -> float:
+        """Half a bit of commanded plus half a bit of reported torque [N m], and rounding"""
+        return self.protocol.resolution(self.plan) + 1e-6
+
+    def new_host(self) -> Host:
+        return self.protocol.host(self.plan)
+
+    def beginning(self) -> list[Frame]:
+        """What else is on the bus at the beginning of every cycle, before the host's frames."""
+        if self.master is None:
+            return []
+        sync = self.master.sync()
+        return [*self.master.poll(self.time_ns), *([] if sync is None else [sync])]
 
     @property
     def motors(self) -> list[Motor]:
@@ -110,7 +100,7 @@ class Rig:
         """One bus cycle at `time_ns`, which then is the next one's."""
         self.advance(self.time_ns)
         if command:
-            self.to_drives(self.time_ns, self.protocol.beginning(self.plan, self.time_ns))
+            self.to_drives(self.time_ns, self.beginning())
             self.to_drives(self.time_ns, self.host.poll(self.time_ns))
             self.to_drives(self.time_ns, self.host.command(self.time_ns, right, left))
         self.time_ns += self.plan.period_ns
@@ -153,7 +143,11 @@ def rig(name: str) -> Rig:
 
 
 def make_rig(name: str, **changes: Any) -> Rig:
-    return Rig(PROTOCOLS[name], drive_plan(name, **changes))
+    return Rig(drive_plan(name, **changes))
+
+
+def make_drives(plan: DrivePlan) -> list[Drive]:
+    return [plan.protocol.made.drive(plan, number) for number in range(len(plan.protocol.made.wheels))]
 
 
 def enabled_rig(name: str, right: float = 0.5, left: float = -0.25, **changes: Any) -> Rig:
@@ -163,7 +157,7 @@ def enabled_rig(name: str, right: float = 0.5, left: float = -0.25, **changes: A
     while rig.time_ns < 0:  # the run begins
         rig.cycle()
     rig.cycles(3, right, left)
-    assert rig.torques() == pytest.approx([right, left], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([right, left], abs=rig.resolution)
     return rig
 
 
@@ -185,13 +179,13 @@ def test_bring_up_enables_without_torque(rig: Rig) -> None:
     assert rig.host.fault == ""
     assert rig.host.torque_ns is not None
     rig.cycles(5, 0.7, -0.7)
-    assert rig.torques() == pytest.approx([0.7, -0.7], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.7, -0.7], abs=rig.resolution)
 
 
 def test_right_is_right_and_forward_is_positive(name: str) -> None:
     rig = enabled_rig(name, 1.0, -0.5)
     rig.cycles(20, 1.0, -0.5)
-    assert rig.host.torque == pytest.approx((1.0, -0.5), abs=rig.protocol.resolution(rig.plan))
+    assert rig.host.torque == pytest.approx((1.0, -0.5), abs=rig.resolution)
     assert rig.motors[0].counts > 0 > rig.motors[1].counts
 
 
@@ -208,7 +202,7 @@ def test_reported_torques_are_the_commanded_ones(protocol: str, wanted: list[tup
     for right, left in wanted:
         rig.cycle(right, left)
         heard.append(rig.host.torque)
-    resolution = rig.protocol.resolution(rig.plan) * 1.000001 + 1e-6
+    resolution = rig.resolution * 1.000001
     for before, (right, left) in zip(wanted, heard[1:], strict=False):
         assert abs(right - before[0]) <= resolution
         assert abs(left - before[1]) <= resolution
@@ -227,7 +221,7 @@ def test_reported_torque_is_the_mean_of_the_period(name: str) -> None:
         start_ns = rig.time_ns
         rig.cycle(0.8, 0.8)
         if means:
-            assert rig.host.torque[0] == pytest.approx(means[-1], abs=rig.protocol.resolution(rig.plan) + 1e-4)
+            assert rig.host.torque[0] == pytest.approx(means[-1], abs=rig.resolution + 1e-4)
         step_ns = MS // 20
         torque = [rig.motors[0].torque for _ in instants(rig, start_ns, start_ns + PERIOD_NS, step_ns)]
         means.append((sum(torque) - (torque[0] + torque[-1]) / 2) * step_ns / PERIOD_NS)
@@ -237,7 +231,7 @@ def test_reported_torque_is_the_mean_of_the_period(name: str) -> None:
 
 def test_watchdog_trips_exactly_when_it_says(name: str) -> None:
     rig = enabled_rig(name)
-    fed_ns = max(time_ns for time_ns, frame in rig.commanded if rig.protocol.feeds(frame))
+    fed_ns = rig.commanded[-1][0]
     before = rig.torques()
     assert all(before)
     rig.advance(fed_ns + WATCHDOG_NS - 1)
@@ -265,7 +259,7 @@ def test_watchdog_trips_at_its_time_even_if_time_is_asked_later(name: str) -> No
 
 def test_a_disabled_drive_needs_no_commands(rig: Rig) -> None:
     rig.cycles(3 * CYCLES, command=False)
-    _, rig.host = rig.protocol.make(rig.plan)
+    rig.host = rig.new_host()
     rig.bring_up()
     assert rig.host.fault == ""
 
@@ -306,7 +300,7 @@ def test_recovery_after_its_time_and_first_with_zero(name: str, fault: Fault) ->
         assert not rig.host.enabled
     rig.cycles(CYCLES, 0.5, -0.25)
     assert rig.host.enabled
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
     assert rig.refused() == refused  # no torque was refused: the first one was zero
 
 
@@ -320,7 +314,7 @@ def test_a_fault_whose_cause_persists_cannot_be_cleared(name: str) -> None:
     rig.mend(1, Fault.OVER_TEMPERATURE)
     rig.cycles(2 * CYCLES, 0.5, -0.25)
     assert rig.host.enabled
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
 
 
 def test_of_two_causes_both_must_go(name: str) -> None:
@@ -378,7 +372,7 @@ def test_watchdog_fault_recovers_too(name: str) -> None:
     rig.cycles(CYCLES, 0.5, -0.25)
     assert rig.host.enabled
     assert rig.host.fault == ""
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
 
 
 @pytest.mark.parametrize("wheel", WHEELS)
@@ -399,7 +393,7 @@ def test_a_silent_drive(name: str, wheel: int) -> None:
     assert [motor.torque for motor in drive.motors] == [0.0] * len(drive.motors)
     rig.cycles(2 * CYCLES, 0.5, -0.25)
     assert rig.host.enabled
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
 
 
 def test_the_host_notices_silence_in_the_watchdogs_time(name: str) -> None:
@@ -439,7 +433,7 @@ def test_stuck_torque_stays_whatever_is_commanded(name: str) -> None:
     stuck = rig.torques()[0]
     rig.cycles(5, -1.0, -1.0)
     assert rig.torques()[0] == stuck
-    assert rig.host.torque == pytest.approx((0.5, -1.0), abs=rig.protocol.resolution(rig.plan))
+    assert rig.host.torque == pytest.approx((0.5, -1.0), abs=rig.resolution)
     rig.to_drives(rig.time_ns, rig.host.stop(rig.time_ns))
     rig.cycles(5, -1.0, -1.0)
     assert rig.torques() == [stuck, 0.0]
@@ -473,7 +467,7 @@ def test_stop_takes_the_torque_and_start_gives_it_back(name: str, how: str, faul
         rig.cycle(0.5, -0.25)
     assert rig.host.enabled
     assert rig.host.fault == ""
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
     assert rig.refused() == refused
     rig.inject(1, Fault.ENCODER_LOSS)
     rig.cycle(0.5, -0.25)
@@ -490,22 +484,14 @@ def test_an_estop_that_was_lost_is_repeated(name: str) -> None:
     repeated = []
     for _ in range(CYCLES):
         rig.advance(rig.time_ns)
-        rig.to_drives(rig.time_ns, rig.protocol.beginning(rig.plan, rig.time_ns))
+        rig.to_drives(rig.time_ns, rig.beginning())
         frames = [*rig.host.poll(rig.time_ns), *rig.host.command(rig.time_ns, 0.5, 0.5)]
-        repeated += [frame for frame in frames if is_estop(name, frame)]
-        rig.to_drives(rig.time_ns, [frame for frame in frames if is_estop(name, frame)])
+        repeated += [frame for frame in frames if PROTOCOLS[name](frame)]
+        rig.to_drives(rig.time_ns, [frame for frame in frames if PROTOCOLS[name](frame)])
         rig.time_ns += rig.plan.period_ns
     assert estops
     assert repeated
     assert rig.torques() == [0.0, 0.0]
-
-
-def is_estop(name: str, frame: Frame) -> bool:
-    if name == "native":
-        return frame.data[4] & 32 != 0
-    if name == "odrive":
-        return frame.can_id & 31 == 2
-    return frame.can_id & 0x780 == 0x200 and frame.data[:2] == b"\x02\x00"
 
 
 def test_a_quick_stop_is_left_to_the_drive() -> None:
@@ -530,7 +516,7 @@ def test_an_estop_that_is_over_at_once(name: str, cycles: int) -> None:
     rig.host.start()
     rig.cycles(2 * CYCLES, 0.5, -0.25)
     assert rig.host.enabled
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
 
 
 def test_a_host_that_begins_anew(name: str) -> None:
@@ -538,22 +524,22 @@ def test_a_host_that_begins_anew(name: str) -> None:
     rig = enabled_rig(name, recover_ns=100 * MS)
     rig.cycles(20, command=False)
     assert rig.torques() == [0.0, 0.0]
-    _, rig.host = rig.protocol.make(rig.plan)
+    rig.host = rig.new_host()
     rig.cycles(2 * CYCLES, 0.5, -0.25)
     assert rig.host.enabled
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
 
 
 def test_a_host_that_begins_anew_while_drives_are_enabled(name: str) -> None:
     """It has their wheels without a fault, or after one: but no torque that it did not ask for."""
     rig = enabled_rig(name, recover_ns=100 * MS)
-    _, rig.host = rig.protocol.make(rig.plan)
+    rig.host = rig.new_host()
     rig.cycle()
     rig.cycle()
     assert rig.torques() == [0.0, 0.0]
     rig.cycles(2 * CYCLES, 0.5, -0.25)
     assert rig.host.enabled
-    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.5, -0.25], abs=rig.resolution)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), inf, -inf])
@@ -578,7 +564,7 @@ def test_torque_is_limited_to_the_motors(name: str) -> None:
     rig = make_rig(name, motor=motor_plan(torque_limit=0.75))
     rig.bring_up()
     rig.cycles(3, 1.4, -1.4)
-    assert rig.torques() == pytest.approx([0.75, -0.75], abs=rig.protocol.resolution(rig.plan))
+    assert rig.torques() == pytest.approx([0.75, -0.75], abs=rig.resolution)
 
 
 def test_heat_is_a_fault_of_its_own(name: str) -> None:
@@ -599,8 +585,7 @@ def test_heat_is_a_fault_of_its_own(name: str) -> None:
 def test_what_is_sent_does_not_depend_on_when_time_is_asked(protocol: str, steps_us: list[int]) -> None:
     """A drive alone: the same frames in the same order, whether time passes in these steps or at once, and no sooner."""
     plan = drive_plan(protocol)
-    (one, *_), _ = PROTOCOLS[protocol].make(plan)
-    (other, *_), _ = PROTOCOLS[protocol].make(plan)
+    one, other = make_drives(plan)[0], make_drives(plan)[0]
     time_ns = -77 * MS
     frames = one.advance(time_ns)
     others = other.advance(time_ns)

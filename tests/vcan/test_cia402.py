@@ -189,7 +189,7 @@ class Slave:
 
 def test_our_host_drives_foreign_slaves(network: Any) -> None:
     slaves = [Slave(network, node_id) for node_id in PLAN.node_ids]
-    host, master = Cia402Host(PLAN, 0), Master(PLAN.period_ns, PLAN.watchdog_ns)
+    host, master = Cia402Host(PLAN), Master(PLAN.period_ns, PLAN.watchdog_ns)
     with open_bus(URL) as bus:
 
         def cycle(right: float, left: float) -> None:

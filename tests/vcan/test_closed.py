@@ -60,7 +60,7 @@ def in_one_process(scenario: Path, overrides: Sequence[str], folder: Path) -> st
     display = Display(plan, quiet=True)
     done = execute(loaded, plan, folder, engine="inprocess", clock="virtual", can_urls=(), display=display)
     assert done.failure is None
-    return str(done.summary["trace_digest"])
+    return str(done.summary.trace_digest)
 
 
 def as_processes(
@@ -68,7 +68,7 @@ def as_processes(
 ) -> subprocess.Popen[str]:
     """Starts a run as processes with its frames on an interface."""
     settings = [word for override in overrides for word in ("--set", override)]
-    command = [sys.executable, "-m", "echelon.cli", "run", str(scenario), *settings, *more]
+    command = [sys.executable, "-m", "echelon", "run", str(scenario), *settings, *more]
     command += ["--can", f"socketcan:{interface}", "--no-report", "--quiet", "--out", str(folder)]
     return subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from echelon.bridge.bus import open_bus
+from echelon.bridge.cyclic import WheelState
 from echelon.bridge.frame import Frame
 from echelon.bridge.motor import Fault
-from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec, WheelState
+from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec
 from echelon.bridge.native.drive import NativeDrive
 from echelon.bridge.native.host import NativeHost
 from tests.bench_drives import MS, Bench, drive_plan
@@ -32,7 +33,7 @@ ON, FAULT = WheelState.ENABLED, WheelState.FAULT
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    with Bench(URL, [NativeDrive(PLAN, ROBOT)]) as running:
+    with Bench(URL, [NativeDrive(PLAN)]) as running:
         yield running
 
 
@@ -109,7 +110,7 @@ def test_a_fault_made_to_happen(bench: Bench, client: Client) -> None:
 
 
 def test_our_host_brings_the_drive_up(bench: Bench) -> None:
-    host, last_ns = NativeHost(PLAN, ROBOT), 0
+    host, last_ns = NativeHost(PLAN), 0
     with open_bus(URL) as bus:
         for _ in range(500):
             received = bus.recv(10.0)

@@ -165,7 +165,7 @@ def test_our_host_brings_up_the_packages_mock() -> None:
 
     async def run() -> None:
         mocks: list[Any] = [ODriveCANMock(axis, socketcan()) for axis in plan.node_ids]
-        host = ODriveHost(plan, 0)
+        host = ODriveHost(plan)
         with open_bus(URL) as bus, open_bus(URL) as listener:
 
             async def cycles(right: float, left: float, until: Callable[[], bool]) -> None:

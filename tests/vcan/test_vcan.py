@@ -15,8 +15,10 @@ from bench.can import bus_rates
 from echelon.bridge.bus import Bus, open_bus
 from echelon.bridge.bus_url import listen_command, resolve_url
 from echelon.bridge.native.codec import NativeCodec, Torque
-from echelon.bridge.torque_mirror import Frame, TorqueMirror
+from echelon.bridge.native.host import NativeHost
+from echelon.bridge.torque_mirror import TorqueMirror
 from echelon.sim.can_checks import check_interfaces, check_vcan
+from tests.bench_drives import drive_plan
 from tests.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan
@@ -41,7 +43,7 @@ def listener(interface: str = "vcan0") -> socket.socket:
     return raw
 
 
-def next_frame(raw: socket.socket) -> Frame:
+def next_frame(raw: socket.socket) -> tuple[int, bytes]:
     can_id, length, data = struct.unpack("=IB3x8s", raw.recv(16))
     return can_id, data[:length]
 
@@ -50,15 +52,16 @@ def torques(step: int, robot: int) -> tuple[float, float]:
     return 0.0123 * step - robot, 0.00045678 * step * robot
 
 
-def run(bus: Bus) -> list[Frame]:
+def run(bus: Bus) -> list[tuple[int, bytes]]:
     """Sends STEPS periods of all robots through a bridge."""
-    bridge = TorqueMirror(ROBOTS, SCALE, 10_000_000)
+    plans = [drive_plan("native", (robot, robot), torque_scale=SCALE) for robot in range(len(ROBOTS))]
+    bridge = TorqueMirror([NativeHost(plan) for plan in plans], 10_000_000)
     sent = []
     for step in range(STEPS):
         for robot in range(len(ROBOTS)):
-            for can_id, data in bridge.encode(step * 10_000_000, robot, *torques(step, robot)):
-                bus.send(can_id, data, step * 10_000_000)
-                sent.append((can_id, data))
+            for frame in bridge.encode(step * 10_000_000, robot, *torques(step, robot)):
+                bus.send(frame.can_id, frame.data, step * 10_000_000)
+                sent.append((frame.can_id, frame.data))
     assert len(sent) == bridge.frames == STEPS * len(ROBOTS) >= 2000
     return sent
 
@@ -213,7 +216,7 @@ def test_multicast_beside_it() -> None:
 def test_a_whole_run_as_processes_is_on_the_bus(tmp_path: Path) -> None:
     """Thirteen members, recorder and bridge; candump beside them hears every torque, and cantools reads it in N m."""
     folder = tmp_path / "run"
-    run_command = [sys.executable, "-m", "echelon.cli", "run", "lab", "--set", "duration=1", "--set", "claims=[]"]
+    run_command = [sys.executable, "-m", "echelon", "run", "lab", "--set", "duration=1", "--set", "claims=[]"]
     run_command += ["--can", "socketcan:vcan0", "--no-report", "--quiet", "--out", str(folder)]
     listen = ["candump", "-L", "vcan0", "-n", "900", "-T", "60000"]
     with subprocess.Popen(listen, stdout=subprocess.PIPE, text=True) as candump:

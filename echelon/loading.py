@@ -1,15 +1,16 @@
-"""Reading a scenario: TOML, overrides, and mistakes explained in one line (file, key, value, what is allowed)."""
+"""Reading a scenario: TOML, overrides, and mistakes explained, a line each (file, key, value, what is allowed)."""
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import tomlkit
 from pydantic import ValidationError
 
-from echelon.explain import explain, key_text, one_line, short
+from echelon.errors import UserError
+from echelon.explain import explain, is_array, key_text, short
 from echelon.part_fields import PartContext
 from echelon.plan import Plan
 from echelon.planning import PlanError, make_plan
@@ -17,11 +18,8 @@ from echelon.plugins import Registry, Source
 from echelon.scenario import Scenario
 
 
-class ScenarioError(Exception):
-    """A mistake in a scenario or an override; the text is one line for its author."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(one_line(text))
+class ScenarioError(UserError):
+    """Mistakes in a scenario or its overrides, a line each; the first begins with the file."""
 
 
 def load(path: Path, overrides: Sequence[str], registry: Registry) -> tuple[Scenario, Plan]:
@@ -46,32 +44,41 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
     if not table and not overrides:
         needed = [key for key, field in Scenario.model_fields.items() if field.is_required()]
         raise ScenarioError(f"{name}: empty; a scenario needs {', '.join(needed)}")
-    changed = {}
+    changed: dict[str, str] = {}
+    refused: list[tuple[str, str]] = []
     for override in overrides:
         try:
             changed[_override(table, override)] = override
         except OverrideError as error:
-            raise ScenarioError(f"{name} with --set {short(override)}: {error}") from None
-
-    def mistake(keys: str, text: str) -> ScenarioError:
-        return ScenarioError(f"{name}{_overridden(keys, changed)}: {text}")
-
+            refused.append((f"with --set {short(override)}", str(error)))
+    if refused:
+        raise _scenario_error(name, refused)
     try:
         scenario = Scenario.model_validate(table, context=PartContext(registry, folder))
         return scenario, make_plan(scenario, registry)
     except ValidationError as error:
-        found = explain(error.errors(include_url=False), Scenario)
-        raise mistake(key_text(found.keys), found.text) from None
+        mistakes = explain(error.errors(include_url=False), Scenario)
+        found = [(key_text(mistake.keys), mistake.text) for mistake in mistakes]
     except PlanError as error:
-        raise mistake(str(error).split(" = ")[0].split(":")[0], str(error)) from None
+        found = [(line.split(" = ")[0].split(":")[0], line) for line in error.lines]
     except RecursionError:
-        raise mistake("formation", "formation: groups are nested too deep") from None
+        found = [("formation", "formation: groups are nested too deep")]
+    raise _scenario_error(name, [(_overridden(key, changed), text) for key, text in found])
+
+
+def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioError:
+    """Returns the error that tells mistakes: each with the override it comes from, or an empty string."""
+    (where, text), *others = dict.fromkeys(mistakes)
+    first = f"{name} {where}: {text}" if where else f"{name}: {text}"
+    return ScenarioError(first, *(f"{where}: {text}" if where else text for where, text in others))
 
 
 def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None) -> str:
     """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario.
 
     `names` are other names for files of parts."""
+    import tomlkit  # which takes long, and is needed by those who write alone
+
     return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True, context=names))
 
 
@@ -90,12 +97,19 @@ class OverrideError(ValueError):
     """An override that cannot be applied."""
 
 
+_INDEX = re.compile(r"\s*\[\s*([0-9]{1,9})\s*\](?=\s*(?:[.\[]|$))")
+"""The number of an entry in brackets, at the end of a chunk"""
+
+
 def _override(table: dict[str, Any], override: str) -> str:
-    """Sets one value, as in `law.epsilon=[0.1, 0.2]` or `links.0.delay=0.006`; returns its key."""
+    """Sets one value, as in `law.epsilon=[0.1, 0.2]`, `links.0.delay=0.006` or `links[0].delay=0.006`; returns its key.
+
+    Where an array holds one table alone, its number may be left out: `links.delay=0.006`."""
     key, equals, text = override.partition("=")
-    chunks = [chunk.strip() for chunk in key.split(".")]
+    chunks = [chunk.strip() for chunk in _INDEX.sub(r".\1", key).split(".")]
     if not equals or not all(chunks):
         raise OverrideError("must read key=value, e.g. law.epsilon=[0.1, 0.2]")
+    chunks = _numbered(table, chunks)
     at: Any = table
     for chunk, following in pairwise(chunks):
         empty: Any = [] if _is_number(following) else {}
@@ -116,6 +130,33 @@ def _override(table: dict[str, Any], override: str) -> str:
     else:
         raise OverrideError(f"{short(last)} would stand in a value, not in a table")
     return key_text(chunks)
+
+
+def _numbered(table: dict[str, Any], chunks: Sequence[str]) -> list[str]:
+    """Returns a path of keys with the numbers that were left out of it.  Raises OverrideError where it is not clear which."""
+    path: list[str] = []
+    at: Any = table
+    for chunk in chunks:
+        if not _is_number(chunk) and is_array(path, Scenario) and (at is None or _holds_tables(at)):
+            entries = at or []
+            if len(entries) != 1:
+                array, rest = ".".join(path), ".".join(chunks[len(path) :])
+                have = f"{len(entries)} entries" if entries else "no entry yet"
+                last = f", …, {array}.{len(entries) - 1}.{short(rest)}" if len(entries) > 2 else ""
+                also = f" or {array}.1.{short(rest)}" if len(entries) == 2 else ""
+                raise OverrideError(f"{array} has {have}; give its number: {array}.0.{short(rest)}{also}{last}")
+            path.append("0")
+            at = entries[0]
+        path.append(chunk)
+        if isinstance(at, list):
+            at = at[int(chunk)] if _is_number(chunk) and int(chunk) < len(at) else None
+        else:
+            at = at.get(chunk) if isinstance(at, dict) else None
+    return path
+
+
+def _holds_tables(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
 
 
 def _is_number(chunk: str) -> bool:
@@ -139,8 +180,8 @@ def _value(text: str) -> Any:
 
 
 def _overridden(key: str, changed: dict[str, str]) -> str:
-    """Returns ` with --set …` if what stands at a key comes from an override, or holds something that does."""
+    """Returns `with --set …` if what stands at a key comes from an override, or holds something that does."""
     for path, override in reversed(changed.items()):
         if f"{key}.".startswith(f"{path}.") or f"{path}.".startswith(f"{key}."):
-            return f" with --set {short(override)}"
+            return f"with --set {short(override)}"
     return ""

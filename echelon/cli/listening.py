@@ -1,6 +1,5 @@
 """What `echelon can` and `echelon referee` do: listen to the buses of a scenario, or read the can.log of a run's folder."""
 
-import argparse
 import json
 import select
 import sys
@@ -19,12 +18,9 @@ from echelon.bridge.frame import Frame
 from echelon.bridge.referee import Referee, judge_log, read_run_log
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.closed import LOG
-from echelon.load import ScenarioError
+from echelon.errors import UsageError
 from echelon.plan import Plan
 from echelon.sim.can_table import CanTable, finding_text
-from echelon.sim.parts import parse
-from echelon.sim.results.rendering import json_text
-from echelon.sim.usage import UsageError, scenario_of
 
 TICK_S: Final = 0.1
 """Listening looks up so often though nothing comes"""
@@ -45,97 +41,80 @@ class Heard(NamedTuple):
     frame: Frame | None
 
 
-def can(arguments: argparse.Namespace, console: Console | None = None) -> int:
-    """`echelon can`: shows what is on the buses, or what was at the end of a run."""
-    plan, folder = _plan_of(arguments)
-    live = folder is None or arguments.can is not None
-    if live and arguments.speed is not None:
-        raise UsageError("--speed: is for a run's folder without --can")
-    if arguments.speed is not None and not arguments.speed > 0:
-        raise UsageError(f"--speed {arguments.speed:g}: must be more than 0")
-    console = console or Console()
-    if not live and arguments.speed is None:
-        assert folder is not None
-        table = CanTable(plan, Referee(plan), _names(plan))
-        for logged in _read(folder, plan):
-            table.take(*logged)
-        table.referee.finish(max(table.time_ns, plan.duration_ns))
-        if arguments.json:
-            print(json.dumps(table.data(table.time_ns), allow_nan=False))
-        else:
-            console.print(table.render(table.time_ns, console.width))
-        return 0
-    if live:
-        buses = _open(_urls(plan, arguments.can))
-        table = CanTable(plan, Referee(plan, late=True), tuple(bus.url for bus in buses))
-        source = _listen(buses, arguments.seconds)
-    else:
-        assert folder is not None
-        buses = []
-        table = CanTable(plan, Referee(plan), _names(plan))
-        source = _replay(folder, plan, arguments.speed, arguments.seconds)
-    shown = _Shown(table, console, arguments.json)
+def show_live(
+    plan: Plan, wanted: str | None, seconds: float | None, as_json: bool, console: Console | None = None
+) -> None:
+    """Shows what comes on the plan's buses, until Ctrl-C or for some seconds.  Raises UserError."""
+    buses = _open(_urls(plan, wanted))
+    table = CanTable(plan, Referee(plan, late=True), tuple(bus.url for bus in buses))
     try:
-        for time_ns, number, frame in source:
+        _show(table, _listen(buses, seconds), as_json, console or Console())
+    finally:
+        for bus in buses:
+            bus.close()
+
+
+def show_end(plan: Plan, folder: Path, as_json: bool) -> None:
+    """Shows how a run ended by its can.log.  Raises UserError."""
+    table = CanTable(plan, Referee(plan), _names(plan))
+    for logged in _read(folder, plan):
+        table.take(*logged)
+    table.referee.finish(max(table.time_ns, plan.duration_ns))
+    if as_json:
+        print(json.dumps(table.data(table.time_ns), allow_nan=False))
+    else:
+        console = Console()
+        console.print(table.render(table.time_ns, console.width))
+
+
+def show_again(plan: Plan, folder: Path, speed: float, seconds: float | None, as_json: bool) -> None:
+    """Shows a run's can.log, `speed` times as fast as it was.  Raises UserError."""
+    table = CanTable(plan, Referee(plan), _names(plan))
+    _show(table, _replay(folder, plan, speed, seconds), as_json, Console())
+
+
+def _show(table: CanTable, heard: Iterator[Heard], as_json: bool, console: Console) -> None:
+    shown, time_ns = _Shown(table, console, as_json), 0
+    try:
+        for time_ns, number, frame in heard:
             if frame is not None:
                 table.take(time_ns, number, frame)
-            shown.show(time_ns)
+            shown.show_if_due(time_ns)
     except KeyboardInterrupt:
         pass
     finally:
-        shown.close()
-        for bus in buses:
-            bus.close()
-    return 0
+        shown.close(time_ns)
 
 
-def _judge_run(folder: Path, plan: Plan) -> RefereeReport:
-    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Raises OSError."""
+def judge_run(plan: Plan, folder: Path) -> RefereeReport:
+    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Raises UserError."""
     try:
         run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
     except (OSError, ValueError, KeyError):
         run = {}
     tolerance_ns = plan.can.watchdog_ns // 2 if run.get("clock") == "wall" else None
-    return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=not run.get("failure"))
+    try:
+        return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=not run.get("failure"))
+    except OSError as error:
+        raise UsageError(f"{folder / LOG}: {error.strerror}") from None
 
 
-def referee(arguments: argparse.Namespace) -> int:
-    """`echelon referee`: 1 if something is found."""
-    plan, folder = _plan_of(arguments)
-    if folder is not None and arguments.can is None:
-        try:
-            report = _judge_run(folder, plan)
-        except OSError as error:
-            raise UsageError(f"{folder / LOG}: {error.strerror}") from None
-        said = len(report.findings)
-    else:
-        report = _judge_live(plan, arguments)
-        said = 0
-    if arguments.json:
-        print(json_text(report))
-    else:
-        for finding in report.findings[:said]:
-            where = f"{finding.robot} " if finding.robot else ""
-            print(f"{finding.time:.6f} s  {finding.bus} {finding.id}  {where}{finding.kind}: {finding.text}")
-        print(_verdict(report))
-    return 1 if report.kinds else 0
-
-
-def _judge_live(plan: Plan, arguments: argparse.Namespace) -> RefereeReport:
-    """Listens until told to end; tells the first findings at once."""
-    tolerance = getattr(arguments, "tolerance", None)
-    if tolerance is not None and not 0 <= tolerance < 1e9:
-        raise UsageError(f"--tolerance {tolerance:g}: must be 0 s or more")
-    judge = Referee(plan, tolerance_ns=None if tolerance is None else round(tolerance * 1e9), late=True)
-    buses = _open(_urls(plan, arguments.can))
+def judge_live(
+    plan: Plan, wanted: str | None, seconds: float | None, tolerance_s: float | None, quiet: bool
+) -> RefereeReport:
+    """Listens until Ctrl-C or for some seconds; tells the first findings at once unless `quiet`.  Raises UserError."""
+    if tolerance_s is not None and not 0 <= tolerance_s < 1e9:
+        raise UsageError(f"--tolerance {tolerance_s:g}: must be 0 s or more")
+    judge = Referee(plan, tolerance_ns=None if tolerance_s is None else round(tolerance_s * 1e9), late=True)
+    buses = _open(_urls(plan, wanted))
     time_ns = 0
     try:
-        if not arguments.json:
+        if not quiet:
             print(f"listening on {', '.join(bus.url for bus in buses)}; Ctrl-C ends it", file=sys.stderr, flush=True)
-        for time_ns, number, frame in _listen(buses, arguments.seconds):
+        for time_ns, number, frame in _listen(buses, seconds):
             known = len(judge.kept)
             found = judge.observe(time_ns, number, frame) if frame is not None else []
-            if not arguments.json and len(judge.kept) > known:
+            if not quiet and len(judge.kept) > known:
                 for finding in found:
                     print(finding_text(finding), flush=True)
     except KeyboardInterrupt:
@@ -144,12 +123,20 @@ def _judge_live(plan: Plan, arguments: argparse.Namespace) -> RefereeReport:
         for bus in buses:
             bus.close()
     for finding in judge.finish(time_ns):
-        if not arguments.json:
+        if not quiet:
             print(finding_text(finding))
     return judge.report("bus")
 
 
-def _verdict(report: RefereeReport) -> str:
+def told(report: RefereeReport) -> Iterator[str]:
+    """Yields the findings of a report, a line each."""
+    for finding in report.findings:
+        where = f"{finding.robot} " if finding.robot else ""
+        yield f"{finding.time:.6f} s  {finding.bus} {finding.id}  {where}{finding.kind}: {finding.text}"
+
+
+def verdict(report: RefereeReport) -> str:
+    """Returns what was seen and found, in a line."""
     kinds = ", ".join(f"{kind} {count}" for kind, count in report.kinds.items())
     foreign = f", {report.unknown} frames of others" if report.unknown else ""
     seen = f"{report.frames} frames of {len(report.identifiers)} identifiers{foreign}"
@@ -157,7 +144,7 @@ def _verdict(report: RefereeReport) -> str:
 
 
 class _Shown:
-    """A live table in a terminal, else a line or an object each second."""
+    """A live table in a terminal, else a line or an object each second; and one at the end."""
 
     def __init__(self, table: CanTable, console: Console, as_json: bool) -> None:
         self._table = table
@@ -171,41 +158,29 @@ class _Shown:
         else:
             self._next_s += LINE_S
 
-    def show(self, time_ns: int) -> None:
+    def show_if_due(self, time_ns: int) -> None:
         """Shows how things stand at a run time, if it is time to."""
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
         self._next_s = max(self._next_s + (LINE_S if self._live is None else SHOW_S), now_s)
+        self._show(time_ns)
+        if self._live is not None:  # a table may take long on a slow terminal: frames come first
+            self._next_s = max(self._next_s, now_s + 4 * (time.monotonic() - now_s))
+
+    def close(self, time_ns: int) -> None:
+        """Shows how things stand at the end, and leaves it standing."""
+        self._show(time_ns)
+        if self._live is not None:
+            self._live.stop()
+
+    def _show(self, time_ns: int) -> None:
         if self._live is not None:
             self._live.update(self._table.render(time_ns, self._console.width), refresh=True)
-            # a table may take long on a slow terminal: frames come first
-            self._next_s = max(self._next_s, now_s + 4 * (time.monotonic() - now_s))
         elif self._json:
             print(json.dumps(self._table.data(time_ns), allow_nan=False), flush=True)
         else:
             self._console.print(Text(self._table.line(time_ns)), soft_wrap=True)
-
-    def close(self) -> None:
-        """Leaves the last table standing."""
-        if self._live is not None:
-            self._live.stop()
-
-
-def _plan_of(arguments: argparse.Namespace) -> tuple[Plan, Path | None]:
-    """Returns the plan of a scenario or of a run's folder, and that folder.  Raises UsageError."""
-    folder = Path(arguments.scenario)
-    if not folder.is_dir():
-        return scenario_of(arguments)[1], None
-    if arguments.set:
-        raise UsageError(f"--set {arguments.set[0]}: is for a scenario; {folder} is the folder of a run that has been")
-    path = folder / "scenario.toml"
-    try:
-        return parse(path.read_text(encoding="utf-8"), str(path), (), folder)[1], folder
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
-    except (ScenarioError, ValueError) as error:
-        raise UsageError(str(error)) from None
 
 
 def _urls(plan: Plan, wanted: str | None) -> list[str]:

@@ -1,0 +1,176 @@
+"""Commands about CAN buses: `can`, `referee`, `drives`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from echelon.cli.options import Command, option
+from echelon.cli.shared import JSON, ScenarioOptions, seconds
+from echelon.errors import UsageError
+
+if TYPE_CHECKING:
+    from echelon.plan import Plan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ListenOptions(ScenarioOptions):
+    """Options of a command that listens to buses."""
+
+    can: str | None = field(
+        default=None,
+        metadata=option(
+            "where to listen; of several buses all, with commas between (default: what the scenario says; of a run's "
+            "folder, its can.log is read)",
+            "URL",
+        ),
+    )
+    seconds: float | None = field(
+        default=None, metadata=option("end after so long (default: at Ctrl-C)", "S", parse=seconds)
+    )
+    json: bool = field(default=False, metadata=JSON)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanOptions(ListenOptions):
+    """Options of `echelon can`."""
+
+    speed: float | None = field(default=None, metadata=option("replay a run's can.log, X times as fast as it was", "X"))
+
+
+def can(options: CanOptions) -> int:
+    """Shows what is on a scenario's buses, wheel by wheel; or what was, in a run."""
+    from echelon.cli.listening import show_again, show_end, show_live
+
+    plan, folder = _plan_of(options)
+    if folder is None or options.can is not None:
+        if options.speed is not None:
+            raise UsageError("--speed: is for a run's folder without --can")
+        show_live(plan, options.can, options.seconds, options.json)
+    elif options.speed is None:
+        show_end(plan, folder, options.json)
+    elif options.speed > 0:
+        show_again(plan, folder, options.speed, options.seconds, options.json)
+    else:
+        raise UsageError(f"--speed {options.speed:g}: must be more than 0")
+    return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefereeOptions(ListenOptions):
+    """Options of `echelon referee`."""
+
+    tolerance: float | None = field(
+        default=None,
+        metadata=option("how late a cyclic frame may be, live (default: half its period)", "S"),
+    )
+
+
+def referee(options: RefereeOptions) -> int:
+    """Says what breaks the contract on a scenario's buses, or in a run's can.log; 1 if something does."""
+    from echelon.cli.listening import judge_live, judge_run, told, verdict
+    from echelon.sim.results.rendering import json_text
+
+    plan, folder = _plan_of(options)
+    over = folder is not None and options.can is None
+    if folder is not None and over:
+        report = judge_run(plan, folder)
+    else:
+        report = judge_live(plan, options.can, options.seconds, options.tolerance, quiet=options.json)
+    if options.json:
+        print(json_text(report))
+    else:
+        for line in told(report) if over else ():  # live they are told as they are found
+            print(line)
+        print(verdict(report))
+    return 1 if report.kinds else 0
+
+
+def _plan_of(options: ListenOptions) -> "tuple[Plan, Path | None]":
+    """Returns the plan of a scenario or of a run's folder, and that folder.  Raises UserError."""
+    from echelon.cli.scenario_file import read_scenario
+    from echelon.shipped import run_folder
+
+    folder = run_folder(options.scenario)
+    if folder is not None and options.overrides:
+        raise UsageError(
+            f"--set {options.overrides[0]}: is for a scenario; {folder} is the folder of a run that is over"
+        )
+    return read_scenario(options.scenario, options.overrides)[1], folder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrivesOptions(ScenarioOptions):
+    """Options of `echelon drives`."""
+
+    can: str | None = field(
+        default=None,
+        metadata=option(
+            "socketcan:vcan0, udp_multicast:<group>:<port>, or auto; one for each bus, with commas between "
+            "(default: what the scenario says)",
+            "URL",
+        ),
+    )
+    seconds: float | None = field(
+        default=None, metadata=option("end after so long (default: at Ctrl-C)", "S", parse=seconds)
+    )
+    json: bool = field(default=False, metadata=option("print JSON: an object of what is there, then one each second"))
+
+
+def drives(options: DrivesOptions) -> int:
+    """Serves a scenario's buses with its virtual drives, in real time."""
+    from echelon.cli.drive_bench import serve
+    from echelon.cli.scenario_file import read_scenario
+    from echelon.sim.bus_urls import bus_urls, check_wall_clock
+
+    _, plan = read_scenario(options.scenario, [*options.overrides, "can.path=closed", "can.virtual_drives=true"])
+    urls = bus_urls(plan, options.can, False)
+    if not urls or any(url.startswith("virtual") for url in urls):
+        raise UsageError("drives without a bus to others: give --can socketcan:vcan0, udp_multicast: or auto")
+    check_wall_clock(plan, urls)
+    serve(plan, urls, options.seconds, options.json)
+    return 0
+
+
+COMMANDS: Final[tuple[Command[Any], ...]] = (
+    Command(
+        name="drives",
+        options=DrivesOptions,
+        work=drives,
+        about="""\
+Puts the virtual drives of a scenario on its buses, in real time, without any robot: a bench
+for a host of yours.  Faults that the scenario has for its drives happen, counted from the start.""",
+        examples={
+            "echelon drives lab --can auto": "on vcan0 where there is one, else on a multicast bus, which it names",
+            "echelon drives lab --set robot.drive.protocol=odrive --can socketcan:vcan0": "nine robots with ODrives",
+            "echelon drives lab --seconds 1.0 --json": "for scripts",
+        },
+        codes={0: "ended, by Ctrl-C or by --seconds"},
+    ),
+    Command(
+        name="can",
+        options=CanOptions,
+        work=can,
+        about="""\
+Shows the torque, state and faults of every wheel as the frames on the buses say them, with
+rates and loads: live, a table in a terminal or a line each second; or how a run ended.""",
+        examples={
+            "echelon can lab --can socketcan:vcan0": "live",
+            "echelon can runs/demo": "how a run ended",
+            "echelon can runs/demo --speed 10.0 --json": "a run ten times as fast as it was, an object each second",
+        },
+        codes={0: "shown"},
+    ),
+    Command(
+        name="referee",
+        options=RefereeOptions,
+        work=referee,
+        about="""\
+Looks at frames alone: periods, counters, checksums, limits, state machines, silence.  Says
+what breaks the contract of the scenario's drives and their host.""",
+        examples={
+            "echelon referee runs/demo": "a run that is over",
+            "echelon referee lab --can socketcan:vcan0 --seconds 10.0": "live",
+        },
+        codes={0: "nothing is found", 1: "something breaks the contract"},
+    ),
+)

@@ -1,0 +1,196 @@
+"""What `echelon new` writes: a tame scenario of any size, with a comment on what each part is for.
+
+The robots are those of lab.toml.  They start near the places that the formation wants them in, each a little off."""
+
+from collections.abc import Sequence
+from math import cos, hypot, sin
+from typing import Final
+
+from echelon import shapes
+from echelon.errors import UsageError
+from echelon.members import MAX_ROBOTS
+from echelon.shapes import Point
+from echelon.sim.parts import parse
+
+SIDE: Final = 1.0
+"""Between neighbours in a group [m]"""
+BETWEEN: Final = 1.4
+"""Between groups, beyond their own size [m]"""
+OFF: Final = 0.15
+"""How far from its place a robot, and besides a group, starts [m]"""
+TURN: Final = 2.4
+"""Between the directions in which two neighbours are off [rad], the golden angle: they scatter evenly"""
+FIT: Final = {None: 60, "native": 35, "odrive": 4, "cia402": 12}
+"""Robots that fit a bus of 1 Mbit/s at 100 Hz, by protocol; None: torques alone, as native frames"""
+
+
+def sizes(text: str) -> tuple[int, ...]:
+    """Returns the sizes of the groups that `2x3` (two of three) or `2,3,5` stand for.  Raises UsageError."""
+    first, times, second = text.partition("x")
+    numbers = [second] * int(first) if times and first.isdecimal() and len(first) < 4 else text.split(",")
+    if not all(number.isdecimal() and 0 < int(number) <= MAX_ROBOTS for number in numbers) or not numbers:
+        raise UsageError(f"--groups {text}: must be groups and robots in each, as 2x3, or sizes of groups, as 2,3,5")
+    if sum(map(int, numbers)) > MAX_ROBOTS:
+        raise UsageError(
+            f"--groups {text}: {sum(map(int, numbers))} robots, but a bus has identifiers for {MAX_ROBOTS}"
+        )
+    return tuple(map(int, numbers))
+
+
+def scenario_text(name: str, groups: Sequence[int], drive: str | None) -> str:
+    """Returns the scenario as TOML.  Raises ScenarioError for a name that is none."""
+    head, drives = _head(name, groups, drive), [_DRIVE.format(protocol=drive)] if drive else []
+    lines = [head, *drives, _REST, *_bus(groups, drive), *_claims(groups), *_formation(groups, drive)]
+    text = "\n".join(lines) + "\n"
+    parse(text, f"{name}.toml")
+    return text
+
+
+def _head(name: str, groups: Sequence[int], drive: str | None) -> str:
+    robots = sum(groups)
+    what = f"{robots} robot{'s' if robots > 1 else ''} in {len(groups)} group{'s' if len(groups) > 1 else ''}"
+    how = f"; {drive} drives close the torque path" if drive else ""
+    return _HEAD.format(name=name, description=f"{what}, ahead in a straight line{how}")
+
+
+def _bus(groups: Sequence[int], drive: str | None) -> list[str]:
+    """Returns the tables of the buses: one where all robots fit it, else as many as each group needs."""
+    count = len({bus for group in _buses(groups, drive) for bus in group})
+    path = (
+        ['path = "closed"  # the plant takes what the drives report; "mirror": the bus only shows the torques']
+        if drive
+        else []
+    )
+    several = [f"buses = {{ {', '.join(f'can{number} = {{}}' for number in range(count))} }}"] if count > 1 else []
+    return ["[can]", "bitrate = 1_000_000", *path, *several, ""]
+
+
+def _buses(groups: Sequence[int], drive: str | None) -> list[list[int]]:
+    """Returns the number of each robot's bus, group by group."""
+    if sum(groups) <= FIT[drive]:
+        return [[0] * size for size in groups]
+    first, found = 0, []
+    for size in groups:
+        found.append([first + robot // FIT[drive] for robot in range(size)])
+        first = found[-1][-1] + 1
+    return found
+
+
+def _claims(groups: Sequence[int]) -> list[str]:
+    """Returns what a run is to show, for the blocks that there are."""
+    blocks = {"intra": (4.0, max(groups) > 1), "inter": (8.0, len(groups) > 1), "centroid": (15.0, True)}
+    lines = ["# What a run is expected to show; its verdict fails otherwise."]
+    for block, (settled_by, there) in blocks.items():
+        if there:
+            lines += ["[[claims]]", f'block = "{block}"', f"settled_by = {settled_by}  # [s]", ""]
+    return lines
+
+
+def _formation(groups: Sequence[int], drive: str | None) -> list[str]:
+    """Returns the tree: groups side by side, their robots around them."""
+    radius = max(hypot(*point) for size in groups for point in _points(size, SIDE))
+    apart = round(2 * radius + BETWEEN, 1)
+    middles = _points(len(groups), apart, groups)
+    buses = _buses(groups, drive)
+    several = max(map(max, buses)) > 0
+    lines = [
+        "# The tree: a formation of groups, groups of robots.  Shapes are wanted, starts are where robots are at first."
+    ]
+    lines += ["[formation]", *_shape(len(groups), apart)]
+    robot = 0
+    for number, (size, middle) in enumerate(zip(groups, middles, strict=True), start=1):
+        lines += ["", f"[formation.groups.g{number}]", *_shape(size, SIDE), f"[formation.groups.g{number}.robots]"]
+        for place, bus in zip(_points(size, SIDE), buses[number - 1], strict=True):
+            robot += 1
+            x, y = (
+                middle[axis] + place[axis] + OFF * (turn(TURN * robot) + turn(TURN * number))
+                for axis, turn in enumerate((cos, sin))
+            )
+            on = f', bus = "can{bus}"' if several else ""
+            lines.append(f"r{robot} = {{ start = [{x:.2f}, {y:.2f}]{on} }}")
+    return lines
+
+
+def _shape(count: int, side: float) -> list[str]:
+    """Returns the key that names the shape of some children."""
+    if count == 1:
+        return []
+    kind, key = {2: ("line", "spacing"), 3: ("triangle", "side")}.get(count, ("polygon", "side"))
+    return [f'shape = {{ kind = "{kind}", {key} = {side} }}']
+
+
+def _points(count: int, side: float, weights: Sequence[int] = ()) -> list[Point]:
+    """Returns the places of children in their shape, about their (weighted) centroid [m]."""
+    points = {1: [(0.0, 0.0)], 2: shapes.line(2, side), 3: shapes.triangle(side)}.get(count) or shapes.polygon(
+        count, side
+    )
+    heavy = weights or [1] * count
+    middle = [sum(w * point[axis] for w, point in zip(heavy, points, strict=True)) / sum(heavy) for axis in (0, 1)]
+    return [(point[0] - middle[0], point[1] - middle[1]) for point in points]
+
+
+_HEAD = """\
+# What each key means, and all others: `echelon schema scenario --markdown`.  SI units throughout.
+name = "{name}"
+description = "{description}"
+duration = 30.0  # [s]
+seed = 1  # of everything random
+
+[periods]
+acceleration = 0.01  # [s]: the control loop
+torque = 0.01  # [s]: the torque loop in the robot
+
+# What all robots have in common.  A group's `robot`, and a robot itself, may say otherwise.
+[robot]
+mass = 4.0
+inertia = 0.12
+wheel_radius = 0.05
+arm = 0.15  # half the track
+offset = 0.1  # from the axle to the point that is controlled
+heading = 0.0  # at the start, in radians
+torque_limit = 1.5
+torque_rate_limit = 100.0
+wheel_speed_limit = 40.0
+"""
+_DRIVE = """\
+[robot.drive]
+protocol = "{protocol}"
+torque_limit = 1.8
+rated_torque = 1.0
+lag = 0.001  # of the current loop
+
+# The last gate before the bus: what it does not let pass becomes zero torque.
+[robot.envelope]
+torque_limit = 1.5
+rise_limit = 1.05
+fall_limit = 1.05
+window_limit = 3.0
+"""
+_REST = """\
+# Where the centroid of all robots is to be.
+[trajectory]
+kind = "line"
+start = [0.8, 0.0]  # where it is at time 0: the robots have to catch up
+velocity = [0.2, 0.0]
+
+# Each layer has a time scale: groups settle before the formation does, and that before the centroid.
+[law]
+epsilon = [0.5, 0.5]
+lead = 0.5
+
+[[law.gains]]
+k1 = 0.25
+k2 = 1.0
+
+[avoidance]
+enabled = true
+avoidance_radius = 0.32
+sensing_radius = 0.6
+force_limit = 20.0
+
+# Delay and loss, to try what they do (`echelon analyse` says how much delay the law bears):
+# [[links]]
+# channel = "state"
+# delay = 0.05
+# loss = 0.1
+"""

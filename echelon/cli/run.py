@@ -1,0 +1,101 @@
+"""`echelon run`: from what the user typed to a run, its folder, and the exit code."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+from echelon.cli.options import Command, option
+from echelon.cli.shared import ScenarioOptions, seconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions(ScenarioOptions):
+    """Options of `echelon run`."""
+
+    engine: Literal["processes", "inprocess"] = field(
+        default="processes", metadata=option("every role its own process over Zenoh, or all roles in one process")
+    )
+    clock: Literal["virtual", "wall"] = field(
+        default="virtual",
+        metadata=option("as fast as messages come, bit for bit repeatable; or paced by real time"),
+    )
+    out: Path | None = field(
+        default=None, metadata=option("folder of the run (default: runs/<scenario>-<utc time>)", "DIR")
+    )
+    can: str | None = field(
+        default=None,
+        metadata=option(
+            "where frames go: socketcan:vcan0, udp_multicast:<group>:<port>, virtual, auto or none; one for each bus, "
+            "with commas between (default: what the scenario says)",
+            "URL",
+        ),
+    )
+    json: bool = field(default=False, metadata=option("print the summary as JSON"))
+    quiet: bool = field(default=False, metadata=option("show no progress"))
+    no_report: bool = field(default=False, metadata=option("write no report.html"))
+    stall_timeout: float = field(
+        default=30.0,
+        metadata=option("give a run up that stands still for so long, in virtual time", "S", parse=seconds),
+    )
+
+
+def run(options: RunOptions) -> int:
+    """Runs a scenario; leaves a folder."""
+    if options.engine == "processes":
+        from echelon.sim.children import warm_up
+
+        warm_up()
+    from echelon.cli.scenario_file import read_scenario
+    from echelon.sim.launch import Launch, launch
+    from echelon.sim.results.rendering import json_text
+    from echelon.sim.results.summary import summary_text
+
+    scenario, plan = read_scenario(options.scenario, options.overrides)
+    try:
+        finished = launch(
+            scenario,
+            plan,
+            Launch(
+                engine=options.engine,
+                clock=options.clock,
+                out=options.out,
+                can=options.can,
+                report=not options.no_report,
+                quiet=options.quiet,
+                stall_timeout_s=options.stall_timeout,
+            ),
+        )
+    except OSError as error:
+        print(f"echelon: {error.filename}: {error.strerror or error}", file=sys.stderr)
+        return 3
+    if options.json:
+        print(json_text(finished.summary))
+    else:
+        print(summary_text(finished.summary))
+        print(f"  folder   {finished.folder}")
+    if failure := finished.failure or finished.report_failure:
+        print(f"echelon: {failure}", file=sys.stderr)
+        return 3
+    return 0 if finished.holds else 1
+
+
+COMMANDS: Final = (
+    Command(
+        name="run",
+        options=RunOptions,
+        work=run,
+        about="""\
+Runs a scenario and leaves one folder: report.html, run.mcap (for Foxglove, PlotJuggler and the
+like), can.log, torque.dbc, summary.json, and scenario.toml with every default written out.
+Given the folder of a run, it runs that scenario again, into a new folder.""",
+        examples={
+            "echelon run paper": "the paper's nine robots, thirteen processes over Zenoh",
+            "echelon run lab --clock wall": "in real time, torques on the CAN bus",
+            "echelon run paper --set avoidance.enabled=true --out runs/avoiding": "one value changed, into a folder of yours",
+            "echelon run runs/demo --set duration=1.0": "the scenario of an earlier run again",
+            "echelon run - --quiet --json < my.toml": "from a script",
+        },
+        codes={0: "the verdict holds", 1: "the verdict fails"},
+    ),
+)

@@ -1,0 +1,311 @@
+"""Commands about scenarios: `scenarios`, `new`, `validate`, `analyse`, `dbc`, `schema`."""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from echelon.cli.options import Command, argument, option
+from echelon.cli.shared import JSON, ScenarioOptions
+from echelon.errors import UsageError
+
+if TYPE_CHECKING:
+    from echelon.plan import Plan
+
+LONGEST_DELAY: Final = 500
+"""`echelon analyse` looks for the largest stable delay up to so many ticks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenariosOptions:
+    """Options of `echelon scenarios`."""
+
+    json: bool = field(default=False, metadata=JSON)
+
+
+def scenarios(options: ScenariosOptions) -> int:
+    """Lists the shipped scenarios."""
+    import tomllib
+
+    from echelon.shipped import shipped
+
+    rows = [
+        {"name": name, "path": str(path), "description": tomllib.loads(path.read_text(encoding="utf-8"))["description"]}
+        for name, path in shipped().items()
+    ]
+    if options.json:
+        print(json.dumps(rows, indent=2, ensure_ascii=False))
+        return 0
+    width = max(len(row["name"]) for row in rows)
+    for row in rows:
+        print(f"{row['name']:<{width}}  {row['description']}")
+    return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewOptions:
+    """Options of `echelon new`."""
+
+    name: str = field(metadata=argument("what it is called: NAME.toml is written into this folder", "NAME"))
+    groups: str = field(
+        default="2x3",
+        metadata=option("groups and robots in each (2x3), or the sizes of unequal groups (2,3,5)", "SIZES"),
+    )
+    drive: Literal["native", "odrive", "cia402"] | None = field(
+        default=None,
+        metadata=option(
+            "close the torque path over virtual drives that speak this protocol; otherwise torques are only shown on "
+            "the bus, in native frames"
+        ),
+    )
+    force: bool = field(default=False, metadata=option("replace a file that is there already"))
+
+
+def new(options: NewOptions) -> int:
+    """Writes a scenario to begin with."""
+    from echelon.cli.new_scenario import scenario_text, sizes
+
+    path = Path(f"{options.name}.toml")
+    text = scenario_text(options.name, sizes(options.groups), options.drive)
+    try:
+        with path.open("w" if options.force else "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise UsageError(f"{path}: is there already; --force replaces it") from None
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    print(path)
+    return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValidateOptions(ScenarioOptions):
+    """Options of `echelon validate`."""
+
+    json: bool = field(default=False, metadata=JSON)
+
+
+def validate(options: ValidateOptions) -> int:
+    """Checks a scenario and says what it means."""
+    from echelon.bridge.fit import describe_fit
+    from echelon.cli.scenario_file import read_scenario
+
+    scenario, plan = read_scenario(options.scenario, options.overrides)
+    facts: dict[str, Any] = {
+        "scenario": scenario.name,
+        "robots": len(plan.robots),
+        "groups": len(plan.nodes) - 1,
+        "duration": plan.duration_ns / 1e9,
+        "ticks": plan.duration_ns // plan.robots[0].period_ns,
+        "time_scales": {block.name: block.sigma for block in plan.blocks},
+        "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
+    }
+    if options.json:
+        print(json.dumps(facts, indent=2))
+        return 0
+    print(f"{options.scenario}: valid")
+    print(f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks")
+    print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
+    for line in facts["can"]:
+        print(f"  CAN  {line}")
+    return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnalyseOptions(ScenarioOptions):
+    """Options of `echelon analyse`."""
+
+    json: bool = field(default=False, metadata=JSON)
+
+
+def analyse(options: AnalyseOptions) -> int:
+    """Computes how much delay a scenario's law bears; 1 if it is unstable without any."""
+    from echelon.cli.scenario_file import read_scenario
+    from echelon.controller.sampled import largest_stable_delay, spectral_radius
+
+    _, plan = read_scenario(options.scenario, options.overrides)
+    period_s = plan.root.period_ns / 1e9
+    try:
+        largest = largest_stable_delay(plan, LONGEST_DELAY)
+        radii = {k: spectral_radius(plan, k) for k in ((0,) if largest is None else (largest, largest + 1))}
+    except ValueError as error:
+        raise UsageError(f"{options.scenario}: {error}") from None
+    margins = _margins(plan)
+    if options.json:
+        facts = {
+            "scenario": plan.name,
+            "period": period_s,
+            "blocks": margins,
+            "largest_stable_delay": None if largest is None else largest * period_s,
+            "spectral_radius": radii,
+        }
+        print(json.dumps(facts, indent=2))
+        return 0 if largest is not None else 1
+    print(f"{plan.name}: how old robots' states may be when their leaders use them")
+    for name, row in margins.items():
+        margin_ms = f"{1e3 * row['delay_margin']:.4g} ms"
+        print(f"  {name:<12} σ {row['sigma']:<6.4g} s   margin of the block alone, in continuous time: {margin_ms}")
+    how = f"all blocks together, sampled and held for {1e3 * period_s:g} ms"
+    if largest is None:
+        print(f"  {how}: unstable without any delay")
+        return 1
+    print(f"  {how}: stable up to {largest} ticks, {1e3 * largest * period_s:g} ms")
+    for k, radius in radii.items():
+        print(f"    {k} ticks: spectral radius {radius:.6f}, {'settles' if radius < 1 else 'does not settle'}")
+    return 0
+
+
+def _margins(plan: "Plan") -> dict[str, dict[str, float]]:
+    """Returns each block's time scale [s] and how much delay it bears alone, in continuous time [s]."""
+    from echelon.controller.sampled import delay_margin, linear_gains
+
+    margins = {}
+    for block in plan.blocks:
+        if block.size:
+            gains = linear_gains(plan, block, 0.0)
+            margin = delay_margin(*(float(matrix[0, 0]) for matrix in (gains.K_1, gains.K_2, gains.K_i)))
+            margins[block.name] = {"sigma": block.sigma, "delay_margin": margin}
+    return margins
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DbcOptions(ScenarioOptions):
+    """Options of `echelon dbc`."""
+
+    bus: str | None = field(default=None, metadata=option("which of the scenario's buses, if it has several", "NAME"))
+    json: bool = field(default=False, metadata=option("print JSON: the DBCs by the names of their buses"))
+
+
+def dbc(options: DbcOptions) -> int:
+    """Prints the DBC of a scenario's drives."""
+    from echelon.bridge.plan_dbc import plan_dbc
+    from echelon.cli.scenario_file import read_scenario
+
+    _, plan = read_scenario(options.scenario, options.overrides)
+    names = [bus.name for bus in plan.can.buses]
+    if options.bus not in (None, *names):
+        raise UsageError(f"--bus {options.bus}: must be one of {', '.join(names)}")
+    wanted = [number for number, name in enumerate(names) if options.bus in (None, name)]
+    if options.json:
+        print(json.dumps({names[number]: plan_dbc(plan, number) for number in wanted}, indent=2))
+        return 0
+    if len(wanted) > 1:
+        raise UsageError(
+            f"{options.scenario} has several buses, each with a DBC of its own: give --bus {' or '.join(names)}"
+        )
+    sys.stdout.write(plan_dbc(plan, wanted[0]))
+    return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemaOptions:
+    """Options of `echelon schema`."""
+
+    what: Literal["scenario", "summary"] = field(
+        metadata=argument("scenario: the keys of scenario files; summary: those of a run's summary.json", "WHAT")
+    )
+    markdown: bool = field(default=False, metadata=option("print a reference page for people, Markdown"))
+
+
+def schema(options: SchemaOptions) -> int:
+    """Prints the schema of scenario files or of summary.json."""
+    from echelon.schema import reference_page, scenario_schema
+    from echelon.sim.parts import REGISTRY
+    from echelon.sim.results.rendering import summary_schema
+
+    if options.markdown and options.what != "scenario":
+        raise UsageError(f"--markdown: is for scenario, not for {options.what}")
+    if options.markdown:
+        sys.stdout.write(reference_page(REGISTRY))
+    else:
+        found = scenario_schema(REGISTRY) if options.what == "scenario" else summary_schema()
+        print(json.dumps(found, indent=2, ensure_ascii=False))
+    return 0
+
+
+COMMANDS: Final[tuple[Command[Any], ...]] = (
+    Command(
+        name="scenarios",
+        options=ScenariosOptions,
+        work=scenarios,
+        about="Lists the scenarios that are shipped.  Every command takes them by their names.",
+        examples={
+            "echelon scenarios": "names and descriptions",
+            "echelon scenarios --json": "the same with their files, to look at or to copy",
+        },
+        codes={0: "done"},
+    ),
+    Command(
+        name="new",
+        options=NewOptions,
+        work=new,
+        about="""\
+Writes NAME.toml: a tame scenario that is valid and holds when it is run, with a comment on
+what each part is for.  Then change it: `echelon validate NAME.toml` says what is wrong.""",
+        examples={
+            "echelon new my": "my.toml, two groups of three robots",
+            "echelon new mine --groups 2x3 --drive odrive": "torques over a CAN bus, to ODrives and back",
+            "echelon new ours --groups 2,3,5": "groups of unequal size",
+        },
+        codes={0: "written"},
+    ),
+    Command(
+        name="validate",
+        options=ValidateOptions,
+        work=validate,
+        about="""\
+Checks a scenario.  Says what it means: robots, duration, time scales, whether its frames fit
+its CAN buses; or all that is wrong with it, a line each: key, value, and what is allowed.""",
+        examples={
+            "echelon validate lab": "a shipped scenario",
+            "echelon validate my.toml --set law.lead=0.5": "a file with one value changed",
+            "echelon validate runs/demo --json": "the scenario of a run, for scripts",
+        },
+        codes={0: "valid"},
+    ),
+    Command(
+        name="analyse",
+        options=AnalyseOptions,
+        work=analyse,
+        about="""\
+Computes how old robots' states may be when their leaders use them before the formation does
+not settle any more: each block alone in continuous time, and exactly, all blocks together as
+the law is sampled and held.""",
+        examples={
+            "echelon analyse paper": "stable up to 6 ticks of 1 ms",
+            "echelon analyse paper --set law.lead=0.0": "the paper's law as it stands",
+            "echelon analyse lab --json": "for scripts",
+        },
+        codes={0: "stable, with some delay or none", 1: "unstable without any delay"},
+    ),
+    Command(
+        name="dbc",
+        options=DbcOptions,
+        work=dbc,
+        about="""\
+Prints what the frames of a scenario's drives mean, as a DBC for cantools, SavvyCAN, Wireshark
+and the like.  A run leaves the same in its folder.""",
+        examples={
+            "echelon dbc lab > torque.dbc": "of the only bus",
+            "echelon dbc drives --bus can1": "of one of several buses",
+            "echelon dbc runs/demo": "of a run",
+        },
+        codes={0: "printed"},
+    ),
+    Command(
+        name="schema",
+        options=SchemaOptions,
+        work=schema,
+        about="""\
+Prints the JSON schema of scenario files: with it an editor completes keys, shows what they
+mean, and marks mistakes.  In VS Code (Even Better TOML), Helix or Zed (taplo), the line
+  #:schema ./scenario.schema.json
+at the top of a scenario does that.""",
+        examples={
+            "echelon schema scenario > scenario.schema.json": "for editors",
+            "echelon schema scenario --markdown": "all keys with their defaults and units, for people",
+        },
+        codes={0: "printed"},
+    ),
+)

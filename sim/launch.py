@@ -1,0 +1,100 @@
+"""From a scenario and how it is to be run to a finished run: what the command `echelon run` and `echelon.run` share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from echelon.errors import UsageError, UserError
+from echelon.plan import Plan
+from echelon.scenario import Scenario
+from echelon.sim.bus_urls import bus_urls, check_wall_clock
+from echelon.sim.children import warm_up
+from echelon.sim.live import Display
+from echelon.sim.results.run import Run
+from echelon.sim.run import execute, new_folder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Launch:
+    """How a scenario is to be run; see `echelon run --help`."""
+
+    engine: Literal["processes", "inprocess"] = "processes"
+    clock: Literal["virtual", "wall"] = "virtual"
+    out: Path | None = None
+    can: str | None = None
+    report: bool = True
+    quiet: bool = False
+    stall_timeout_s: float = 30.0
+
+
+def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
+    """Runs a scenario, writes its folder, and says on standard error how it stands.
+
+    Raises UserError for options that do not go together, and OSError if a file of the run cannot be written."""
+    if options.engine == "processes":
+        warm_up()
+    urls = bus_urls(plan, options.can, options.engine == "inprocess")
+    _check(plan, options, urls)
+    folder = _folder(scenario, options.out)
+    display = Display(plan, quiet=options.quiet)
+    if not options.quiet:
+        display.say(_heading(plan, options, folder, urls))
+    try:
+        summary, trace = execute(
+            scenario,
+            plan,
+            folder,
+            engine=options.engine,
+            clock=options.clock,
+            can_urls=urls,
+            display=display,
+            stall_timeout_s=options.stall_timeout_s,
+        )
+    except OSError as error:
+        if error.filename is None:  # of a write to a file that was open
+            error.filename = str(folder)
+        raise
+    finally:
+        display.close()
+    run = Run(trace, summary, folder)
+    if options.report:
+        from echelon.sim.run_folder import report_on  # matplotlib, when it is needed
+
+        try:
+            report_on([folder], folder / "report.html")
+        except (UserError, OSError) as error:  # of a run that broke off there may be nothing to report
+            run.report_failure = f"no report: {error}"
+    return run
+
+
+def _check(plan: Plan, options: Launch, urls: Sequence[str]) -> None:
+    """Raises UsageError for options that do not go together."""
+    if options.clock == "wall":
+        if plan.can.closed and (not urls or options.engine == "inprocess"):
+            raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
+        check_wall_clock(plan, urls)
+    if plan.can.closed and options.engine == "processes" and not urls:
+        raise UsageError("--can none: the closed torque path of several processes needs a bus; or --engine inprocess")
+    if plan.can.closed and options.engine == "processes" and any(url.startswith("virtual") for url in urls):
+        raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
+    if options.clock == "virtual" and not plan.can.virtual_drives:
+        raise UsageError("can.virtual_drives = false: real drives need --clock wall")
+
+
+def _folder(scenario: Scenario, out: Path | None) -> Path:
+    """Returns the folder of the run, made.  Raises UsageError."""
+    try:
+        return new_folder(scenario, out)
+    except OSError as error:
+        if out is not None:
+            raise UsageError(f"--out {out}: {error.strerror}") from None
+        raise UsageError(f"{error.filename}: {error.strerror}; give a folder with --out") from None
+
+
+def _heading(plan: Plan, options: Launch, folder: Path, urls: Sequence[str]) -> str:
+    robots, nodes = len(plan.robots), len(plan.nodes)
+    how = "in one process" if options.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
+    bus = f", frames on {', '.join(urls)}" if urls else ""
+    path = f", {plan.can.path} torque path" if plan.can.closed else ""
+    return f"{plan.name}: {robots} robots, {nodes - 1} leaders, 1 coordinator, {how}{path}{bus}; into {folder}"

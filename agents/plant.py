@@ -194,7 +194,7 @@ class Hill(Plant):
     With m = m1 + load, I' = I + load d², gravity along the slope g⃗ = -9.81 rise/√(1 + |rise|²), c = `resistance`, and F, τ, d,
     R of the robot,
 
-        v̇ = (F - c v)/m + d ω² + g⃗·e_v        ω̇ = (τ - c R² ω - m d (v ω - g⃗·e_n))/I'
+        v̇ = (F - c v)/m + d ω² + g⃗·e_v,       ω̇ = (τ - c R² ω - m d (v ω - g⃗·e_n))/I'
 
     (Newton and Euler; the load is at the reference point, and each wheel has half of c).  x and y are along the slope."""
 

@@ -4,8 +4,8 @@
     trajectory = { use = "my_paths.py:Spiral", parameters = { rate = 0.2 } }         the same for any part
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
-    robot.drive.protocol = "odrive"
     law = { use = "my_laws.py:Relay", parameters = { gain = 2.0 }, epsilon = [0.5] }   beside keys of the table itself
+    robot.drive.protocol = "odrive"
 
 Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
 """
@@ -21,11 +21,11 @@ from echelon.plugins import Part, Registry, Source
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
+_NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.load)"
 PART: Final = "part"
 """Stands in the JSON schema of a field of this kind, with the group of its parts: echelon.schema says what may be written"""
 BESIDE: Final = "beside"
-"""Stands there too; True: parameters are written beside the part's name"""
-_NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.load)"
+"""Stands there too; True: parameters are written beside the part's name; None: in a key of their own"""
 
 
 class PartContext(NamedTuple):
@@ -190,7 +190,8 @@ ProtocolField = Annotated[
     PlainSerializer(_written_by_name),
     WithJsonSchema({PART: "protocols", BESIDE: False}),
 ]
-LawName = Annotated[str, PlainValidator(_named("laws")), WithJsonSchema({"type": "string"})]
+WrittenLawName = Annotated[str, WithJsonSchema({PART: "laws", BESIDE: None})]
+LawName = Annotated[WrittenLawName, PlainValidator(_named("laws"))]
 LawParameters = Annotated[
     Part[Any],
     PlainValidator(_beside_name("laws")),

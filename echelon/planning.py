@@ -69,6 +69,8 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
                 fitting(blocks, claim.block, f"claims.{at}.block")
         coupling = make_coupling(scenario.law, blocks)
     with mistakes.noted():
+        _check_law(scenario.law)
+    with mistakes.noted():
         links = _links(scenario.links, robots, nodes, bus_roles, can)
     with mistakes.noted():
         events = make_events(scenario.events, robots, can)

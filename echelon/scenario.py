@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
 from echelon.can_tables import Can, DriveTable, EnvelopeTable, Event
-from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField, written_use
+from echelon.part_fields import LawName, LawParameters, PlantField, TrajectoryField, WrittenLawName, written_use
 from echelon.values import (
     CouplingGain,
     Finite,
@@ -53,7 +53,8 @@ class RobotTable(Table):
     `[robot]`."""
 
     model: PlantField = None
-    """Plant: `paper` (the paper's equations, the default), `rigid_body` (its mass at the reference point), or your own"""
+    """Plant: `paper` (the paper's equations, the default), `rigid_body` (its mass at the reference point), `hill` (with a load,
+    on a slope), or your own"""
     mass: Positive | None = None
     """m1 [kg]; must be given on some level"""
     inertia: Positive | None = None
@@ -170,23 +171,23 @@ class Law(Table):
     """The control law: time scales, gains and coupling of the blocks (the groups' shapes, the formation's, the centroid)."""
 
     use: LawName = Field(default="linear", validate_default=True)
-    """`linear`, `integral`, `terminal_sliding` (controller.laws), or another (docs/add-a-law.md)"""
+    """`linear` (the paper's), `integral`, `terminal_sliding`, or a law of your own (docs/add-a-law.md)"""
     parameters: LawParameters = Field(default_factory=dict, validate_default=True)
-    """Those of the law that `use` names; validated, they are the law itself, a Part"""
+    """Of the law that `use` names"""  # validated, they are the law itself, a Part
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
     epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
     """ε1, ε2, …: each block's σ is a product of the first ones; as many as the tree has layers, or with `multi` groups
     and the formation"""
     gains: list[Gains] = []
-    """K_1 and K_2 of each block, for laws that use them; later entries override earlier ones"""
+    """K_1 and K_2 of blocks, for laws that use them; later entries override earlier ones"""
     coupling: list[Coupling] = []
     """Coupling of blocks; later entries override earlier ones, and without any there is none"""
     lead: Fraction = 0.0
     """How far ahead the law looks, in periods, for laws that do: 0 is the law as it stands, 0.5 makes up for the hold"""
 
     @field_serializer("use")
-    def _use(self, use: str, info: SerializationInfo) -> str:
+    def _use(self, use: str, info: SerializationInfo) -> WrittenLawName:
         return written_use(self.parameters, info)
 
 

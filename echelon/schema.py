@@ -33,6 +33,10 @@ _USE: Final[Schema] = {
     "required": ["use"],
     "additionalProperties": False,
 }
+WITH_KIND: Final = "trajectories"
+"""Parts whose name is the `kind` of a table, with their parameters beside it"""
+WRITTEN: Final = {"laws": "law.use", "plants": "robot.model.use", "protocols": "robot.drive.protocol.use"}
+"""Where the other parts are named"""
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 HEAD: Final = """\
 # Scenario files
@@ -53,21 +57,38 @@ def scenario_schema(registry: Registry) -> Schema:
     schema["$defs"] |= {USE: _USE}
     docs = {model.__name__: _docstrings(model) for model in _tables(Table)}
     docs[USE] = {key: value["description"] for key, value in _USE["properties"].items()}
-    for group in registry.groups.values():
-        for name, part in group.built_in.items():
-            schema["$defs"][part.__name__] = _part(name, part)
-            docs[part.__name__] = {KIND: f"`{name}`"} | _docstrings(part)
+    for group, name, part in _built_in(registry):
+        schema["$defs"][part.__name__] = _part(group, name, part)
+        docs[part.__name__] = {KIND: f"`{name}`"} | _docstrings(part)
     schema = _plain(_with_parts(schema, registry))
+    schema["$defs"]["Law"]["allOf"] = [
+        {
+            "if": {"properties": {"use": {"const": name}}, "required": ["use"]},
+            "then": {"properties": {"parameters": {"$ref": f"#/$defs/{part.__name__}"}}},
+        }
+        for group, name, part in _built_in(registry)
+        if group == "laws"
+    ]
     for name, table in {Scenario.__name__: schema, **schema["$defs"]}.items():
         for key, value in table["properties"].items():
             value["description"] = docs[name][key]
     return {"$schema": DIALECT, **schema}
 
 
-def _part(name: str, part: type[Plugin]) -> Schema:
-    """Returns the table of a part that is built in, its `kind` beside its parameters."""
+def _built_in(registry: Registry) -> Iterator[tuple[str, str, type[Plugin]]]:
+    """Yields the parts that are built in and have parameters, or else their `kind`, to write: group, name, class."""
+    for group in registry.groups.values():
+        for name, part in group.built_in.items():
+            if part.model_fields or group.name in (WITH_KIND, "laws"):
+                yield group.name, name, part
+
+
+def _part(group: str, name: str, part: type[Plugin]) -> Schema:
+    """Returns the table of the parameters of a part that is built in, with its `kind` where that stands beside them."""
     table = part.model_json_schema()
     assert "$defs" not in table, "parameters of parts are plain values"
+    if group != WITH_KIND:
+        return {"properties": {}, **table}
     properties = {KIND: {"const": name, "type": "string"}, **table.get("properties", {})}
     return {**table, "properties": properties, "required": [KIND, *table.get("required", ())]}
 
@@ -82,6 +103,8 @@ def _with_parts(schema: Any, registry: Registry) -> Any:
         return {key: _with_parts(value, registry) for key, value in schema.items()}
     built_in, use = registry.groups[schema[PART]].built_in, {"$ref": f"#/$defs/{USE}"}
     other = {"type": "string", "not": {"enum": list(built_in)}}  # an installed one, which may take any parameters
+    if schema[BESIDE] is None:
+        return {"oneOf": [{"enum": list(built_in)}, other]}
     if schema[BESIDE]:
         installed = {"type": "object", "properties": {KIND: other}, "required": [KIND]}
         return {"oneOf": [*({"$ref": f"#/$defs/{part.__name__}"} for part in built_in.values()), installed, use]}
@@ -98,6 +121,11 @@ def reference_page(registry: Registry) -> str:
         if kind := table["properties"].get("kind", {}).get("const"):
             where += f", kind `{kind}`"
         sections.append(f"## {where or 'The file'}\n\n{_text(table['description'])}\n\n{_rows(table)}")
+    for group, name, part in _built_in(registry):
+        if group != WITH_KIND and part.model_fields:
+            table = schema["$defs"][part.__name__]
+            where = f"`parameters` of `{WRITTEN[group]} = {json.dumps(name)}`"
+            sections.append(f"## {where}\n\n{_text(table['description'])}\n\n{_rows(table)}")
     return HEAD + "\n".join(sections)
 
 
@@ -202,7 +230,7 @@ def _values(value: Schema) -> str:
         case "array":
             return f"array of {_values(value['items'])}"
         case "object":
-            return "tables by name"
+            return "tables by name" if "patternProperties" in value else "table"
         case "string":
             return "name" if "pattern" in value else "string"
         case "boolean":

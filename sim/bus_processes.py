@@ -33,7 +33,7 @@ from echelon.role import Role
 from echelon.runner import Runner
 from echelon.session import Session
 from echelon.sim.contract import Body, ProcessSpec, StartError, finish, hear_finish, meet
-from echelon.sim.to_supervisor import Failed, Report, Said, Waiting
+from echelon.sim.to_supervisor import Failed, PartFailed, Report, Said, Waiting
 from echelon.sim.watchers import HIGH_WATER, Reception
 from echelon.wire import data_key, encode, join, watch_key
 
@@ -115,13 +115,15 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
     done = threading.Event()
     teller = threading.Thread(target=_tell, args=(station, say, done), name="progress", daemon=True)
     teller.start()
-    failure = ""
+    failure: Failed | PartFailed | None = None
     try:
         runner.lockstep(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off; what was counted so far is still reported
         pass
-    except (BusError, PartRunError) as error:
-        failure = str(error)
+    except BusError as error:
+        failure = Failed(str(error))
+    except PartRunError as error:
+        failure = PartFailed(str(error))
     finally:
         runner.finish()
         done.set()
@@ -129,10 +131,10 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
         try:
             station.stop()
         except PartRunError as error:
-            failure = failure or str(error)
+            failure = failure or PartFailed(str(error))
         station.close()
-    if failure:
-        say(Failed(failure))
+    if failure is not None:
+        say(failure)
         raise SystemExit(1)
     signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
     report: Report = station.report()

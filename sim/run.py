@@ -173,8 +173,6 @@ def _in_process(
     except KeyboardInterrupt:
         failure = "interrupted"
         bridge.interrupt()
-    except PartRunError as error:
-        failure = str(error)
     except TookTooLong as error:
         who = stalled_in(plan, error)
         failure = f"stalled for {stall_timeout_s:.0f} s at t = {time_ns / 1e9:g} s: everyone waits for {who}"

@@ -165,8 +165,8 @@ class Supervisor:
                     if not (child.ready if what == "not ready" else child.done or not child.is_member)
                 ]
                 who = few([child.name + child.runs() for child in late])
-                names = [child.name for child in late[:NAMED]]
-                raise RunError(f"{what} after {timeout_s:g} s: {who}{self._words_of(names)}")
+                words = self._words_of([child.name for child in late[:NAMED]])
+                raise RunError(f"{what} after {timeout_s:g} s: {who}{words}")
 
     def _serve(self, timeout_s: float) -> None:
         """Takes what children say on their control pipes and on standard error."""
@@ -207,7 +207,12 @@ class Supervisor:
                 if said.failure and progress.phase == "running":
                     raise RunError(f"the recording failed: {said.failure}")
             case Failed():
-                raise RunError(f"{child.spec.kind} {child.name} cannot start: {said.text}")
+                starting = progress.phase == "starting"
+                raise RunError(
+                    f"{child.spec.kind} {child.name} cannot start: {said.text}"
+                    if starting
+                    else f"{child.name}: {said.text}"
+                )
             case PartFailed():
                 raise RunError(said.text)
             case Done():

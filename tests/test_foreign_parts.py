@@ -190,8 +190,15 @@ def wheels_are_at_zero(folder: Path, dbc_name: str = "torque.dbc") -> None:
         assert signals["enable_right"] == signals["enable_left"] == 0, name
 
 
-@pytest.mark.parametrize("kind", TEXTS)
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("kind", "way"),
+    [("law", way) for way in WAYS]
+    + [
+        (kind, way)
+        for kind in ("path", "plant")
+        for way in ("in process", "processes", "processes, wall clock, closed")
+    ],
+)
 def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way: str) -> None:
     use = write(folder, kind, f"{LATER[kind]} raise KeyError('w')")
     done = run(folder, use, *WAYS[way])
@@ -205,7 +212,7 @@ def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way
     assert not summary["verdict"]["holds"]
     assert summary["verdict"]["reasons"][0] == said.removeprefix("echelon: ")
     assert summary["run"]["failure"] == said.removeprefix("echelon: ")
-    assert summary["instants"] > 10
+    assert summary["instants"] > 5
     plan = parse((folder / "run" / "scenario.toml").read_text(), "scenario.toml", (), folder / "run")[1]
     assert read_trace(folder / "run" / "run.mcap", plan).digest() == summary["trace_digest"]
     assert echelon("report", folder / "run").returncode == 0
@@ -223,8 +230,11 @@ def test_nonsense_in_a_run_is_named_too(folder: Path, line: str) -> None:
     assert said[0] == said[1]
 
 
-@pytest.mark.parametrize("kind", TEXTS)
-@pytest.mark.parametrize("way", ["in process", "in process, wall clock", "processes", "processes, closed"])
+@pytest.mark.parametrize(
+    ("kind", "way"),
+    [("law", way) for way in ("in process", "in process, wall clock", "processes", "processes, closed")]
+    + [(kind, way) for kind in ("path", "plant") for way in ("in process", "processes")],
+)
 def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str) -> None:
     use = write(folder, kind, f"{LATER[kind]}\n            {HANG}")
     done = run(folder, use, *WAYS[way], "--stall-timeout", "5")
@@ -234,7 +244,7 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     assert f" {RUNS[kind]}" in said
     assert "which runs mine.py:Mine" in said
     assert "Traceback" not in done.stderr
-    assert summary_of(folder / "run")["instants"] > 10
+    assert summary_of(folder / "run")["instants"] > 5
     if "closed" in way:
         wheels_are_at_zero(folder / "run")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import SCENARIOS, plan_of
+from runs import SCENARIOS, plan_of, trace_of
 from test_node import Watched, random_plan
 from trees import PAPER_TREE
 
@@ -19,6 +19,8 @@ from echelon.plan import Plan
 from echelon.plugins import Part
 from echelon.sim.engine import Engine
 from echelon.sim.parts import load, parse
+from echelon.sim.results.blocks import block_series
+from echelon.sim.results.measures import claim_results
 
 OWN = """
 import numpy as np
@@ -274,3 +276,20 @@ def test_where_the_run_diverged_a_law_may_fail() -> None:
 def test_laws_of_this_package_cost_no_checks() -> None:
     plan = plan_of("lab")
     assert make_nu(plan.law, BLOCK).__module__ == "echelon.controller.laws.linear"
+
+
+@pytest.mark.parametrize("name", ["integral", "sliding"])
+def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
+    plan = plan_of(name)
+    claims = claim_results(plan, block_series(trace_of(plan)))
+    assert [claim.block for claim in claims] == ["intra", "inter", "centroid"]
+    assert all(claim.holds for claim in claims), claims
+
+
+def test_what_sliding_claims_takes_the_linear_law_nine_times_as_long() -> None:
+    plan = plan_of("lab", "claims=[{block='intra',settled_by=1.0,band=1e-4},{block='inter',settled_by=1.0,band=1e-4}]")
+    intra, inter = (claim.measured for claim in claim_results(plan, block_series(trace_of(plan))))
+    plan = plan_of("sliding")
+    quick = [claim.measured for claim in claim_results(plan, block_series(trace_of(plan)))]
+    assert intra > 8.5 * quick[0]
+    assert inter > 8.5 * quick[1]

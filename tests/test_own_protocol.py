@@ -121,7 +121,7 @@ def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Pa
     sets = ("--set", "claims=[]", "--set", "can.watchdog=0.5")
     done = echelon("run", scenario, "--clock", "wall", *sets, *QUIET, "--out", tmp_path / "run")
     assert done.returncode == 3
-    assert "bridge: my_drive.py:MyProtocol of r" in done.stderr
+    assert "echelon: my_drive.py:MyProtocol of r" in done.stderr
     assert "its host's command raised KeyError: 'w'" in done.stderr
     commands = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log") if frame.can_id < 0x380]
     assert [(frame.can_id, frame.data) for frame in commands[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]

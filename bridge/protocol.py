@@ -57,10 +57,9 @@ class DriveProtocol(Plugin, ABC):
         all."""
         return ""
 
-    def place(self, drive: DrivePlan) -> str:
-        """Returns where a robot's drives are on their bus, in words."""
-        nodes = [f"{node} {wheel}" for node, wheel in zip(drive.node_ids, WHEELS, strict=True)]
-        return f"nodes {', '.join(nodes)}" if len(self.wheels) == 2 else f"node {drive.node_ids[0]}"
+    def addresses(self, drive: DrivePlan) -> dict[str, dict[str, int]]:
+        """Returns how a host addresses a robot's drives, for people: its `nodes` by wheel, or its `identifiers` by kind."""
+        return {"nodes": dict(zip(WHEELS, drive.node_ids, strict=True))}
 
     # Who speaks and who listens
 

@@ -47,7 +47,7 @@ def _try_robot(plan: Plan, robot: RobotPlan) -> None:
     caller.call("messages", _written, messages)
     _number(caller, "resolution", caller.call("resolution", protocol.resolution, drive))
     caller.call("boot_ups", lambda: dict(protocol.boot_ups(drive)))
-    caller.call("place", protocol.place, drive)
+    _check_addresses(caller, caller.call("addresses", protocol.addresses, drive))
 
 
 def _messages(caller: Caller, what: str, function: Callable[..., Any], *arguments: Any) -> list[Any]:
@@ -65,6 +65,19 @@ def _check_described(caller: Caller, what: str, cyclic: set[int], messages: list
     """What comes regularly must have a DBC message: the load of a bus is computed from it."""
     if lacking := sorted(cyclic - {message.frame_id for message in messages}):
         raise caller.wrong(f"{what}: identifier {lacking[0]:#05x} comes regularly, but `messages` does not describe it")
+
+
+def _check_addresses(caller: Caller, found: Any) -> None:
+    """Checks what is shown of where drives are."""
+    if not (
+        isinstance(found, dict)
+        and len(found) == 1
+        and found.keys() <= {"nodes", "identifiers"}
+        and all(
+            isinstance(numbers, dict) and all(type(n) is int for n in numbers.values()) for numbers in found.values()
+        )
+    ):
+        raise caller.wrong(f"addresses must be nodes or identifiers, numbers by name, not {found!r:.60}")
 
 
 def _written(messages: list[Any]) -> str:

@@ -101,7 +101,7 @@ def test_scripts_get_an_object_of_what_is_there_and_one_each_second() -> None:
     assert (done.returncode, done.stderr) == (0, "")
     bench, *states = map(json.loads, done.stdout.splitlines())
     assert [robot["name"] for robot in bench["robots"]][:2] == ["g1/r1", "g1/r2"]
-    assert bench["robots"][1]["place"] == "command 0x101, feedback 0x181, status 0x201"
+    assert bench["robots"][1]["identifiers"] == {"command": 0x101, "feedback": 0x181, "status": 0x201}
     assert (bench["buses"][0]["url"], bench["period"], bench["watchdog"]) == (bus.url, 0.01, 0.1)
     assert len(states) == 2
     assert states[-1]["sent"] > states[0]["sent"] > 0

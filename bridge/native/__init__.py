@@ -24,10 +24,10 @@ class Native(DriveProtocol):
 
         return frozenset(base + node for base in (BASE_ID, FEEDBACK_ID, STATUS_ID))
 
-    def place(self, drive: DrivePlan) -> str:
+    def addresses(self, drive: DrivePlan) -> dict[str, dict[str, int]]:
         """Returns the identifiers, for there is no node id to be seen on the bus."""
-        command, feedback, status = sorted(self.identifiers(drive.node_ids[0]))
-        return f"command {command:#05x}, feedback {feedback:#05x}, status {status:#05x}"
+        kinds = ("command", "feedback", "status")
+        return {"identifiers": dict(zip(kinds, sorted(self.identifiers(drive.node_ids[0])), strict=True))}
 
     def host(self, drive: DrivePlan) -> Host:
         """Returns what commands a robot's drive."""

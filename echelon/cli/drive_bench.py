@@ -69,7 +69,7 @@ def bench_facts(plan: Plan, urls: Sequence[str]) -> Facts:
                 "name": robot.name,
                 "protocol": robot.drive.protocol.use,
                 "bus": plan.can.buses[robot.drive.bus].name,
-                "place": protocol_of(robot).place(robot.drive),
+                **protocol_of(robot).addresses(robot.drive),
             }
             for robot in plan.robots
         ],
@@ -83,7 +83,11 @@ def bench_lines(bench: Facts) -> list[str]:
     lines = [f"bus {bus['name']}: {bus['url']}; to listen: {bus['listen']}" for bus in bench["buses"]]
     width = max(len(robot["name"]) for robot in bench["robots"])
     for robot in bench["robots"]:
-        lines.append(f"  {robot['name']:<{width}}  {robot['protocol']} on {robot['bus']}, {robot['place']}")
+        if "nodes" in robot:
+            place = "nodes " + ", ".join(f"{node} {wheel}" for wheel, node in robot["nodes"].items())
+        else:
+            place = ", ".join(f"{kind} {can_id:#05x}" for kind, can_id in robot["identifiers"].items())
+        lines.append(f"  {robot['name']:<{width}}  {robot['protocol']} on {robot['bus']}, {place}")
     period_ms, watchdog_ms = 1e3 * bench["period"], 1e3 * bench["watchdog"]
     return [*lines, f"they report every {period_ms:g} ms, and stop after {watchdog_ms:g} ms without a command"]
 

@@ -2,12 +2,15 @@
 
 The robots are those of lab.toml.  They start near the places that the formation wants them in, each a little off."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from math import cos, hypot, sin
 from typing import Final
 
 from echelon import shapes
+from echelon.bridge.fit import bus_fit
 from echelon.errors import UsageError
+from echelon.loading import ScenarioError
 from echelon.members import MAX_ROBOTS
 from echelon.shapes import Point
 from echelon.sim.parts import parse
@@ -20,8 +23,6 @@ OFF: Final = 0.15
 """How far from its place a robot, and besides a group, starts [m]"""
 TURN: Final = 2.4
 """Between the directions in which two neighbours are off [rad], the golden angle: they scatter evenly"""
-FIT: Final = {None: 60, "native": 35, "odrive": 4, "cia402": 12}
-"""Robots that fit a bus of 1 Mbit/s at 100 Hz, by protocol; None: torques alone, as native frames"""
 
 
 def sizes(text: str) -> tuple[int, ...]:
@@ -39,11 +40,34 @@ def sizes(text: str) -> tuple[int, ...]:
 
 def scenario_text(name: str, groups: Sequence[int], drive: str | None) -> str:
     """Returns the scenario as TOML.  Raises ScenarioError for a name that is none."""
-    head, drives = _head(name, groups, drive), [_DRIVE.format(protocol=drive)] if drive else []
-    lines = [head, *drives, _REST, *_bus(groups, drive), *_claims(groups), *_formation(groups, drive)]
-    text = "\n".join(lines) + "\n"
+    text = _text(name, groups, drive, _room(groups, drive))
     parse(text, f"{name}.toml")
     return text
+
+
+def _room(groups: Sequence[int], drive: str | None) -> int:
+    """Returns how many robots may share a bus: all of them if they fit it, else as many as do."""
+    robots = sum(groups)
+    if _fits(robots, drive):
+        return robots
+    return bisect_left(range(1, robots), True, key=lambda room: not _fits(room, drive)) or 1
+
+
+def _fits(robots: int, drive: str | None) -> bool:
+    """True if so many robots fit a bus of 1 Mbit/s."""
+    try:
+        _, plan = parse(_text("probe", [robots], drive, robots), "probe.toml")
+    except ScenarioError:  # there are not so many node ids
+        return False
+    return bus_fit(plan, 0).fits
+
+
+def _text(name: str, groups: Sequence[int], drive: str | None, room: int) -> str:
+    """Returns the scenario with up to `room` robots on a bus."""
+    head, drives = _head(name, groups, drive), [_DRIVE.format(protocol=drive)] if drive else []
+    buses = _buses(groups, room)
+    lines = [head, *drives, _REST, *_bus(buses, drive), *_claims(groups), *_formation(groups, buses)]
+    return "\n".join(lines) + "\n"
 
 
 def _head(name: str, groups: Sequence[int], drive: str | None) -> str:
@@ -53,9 +77,9 @@ def _head(name: str, groups: Sequence[int], drive: str | None) -> str:
     return _HEAD.format(name=name, description=f"{what}, ahead in a straight line{how}")
 
 
-def _bus(groups: Sequence[int], drive: str | None) -> list[str]:
+def _bus(buses: Sequence[Sequence[int]], drive: str | None) -> list[str]:
     """Returns the tables of the buses: one where all robots fit it, else as many as each group needs."""
-    count = len({bus for group in _buses(groups, drive) for bus in group})
+    count = len({bus for group in buses for bus in group})
     path = (
         ['path = "closed"  # the plant takes what the drives report; "mirror": the bus only shows the torques']
         if drive
@@ -65,13 +89,13 @@ def _bus(groups: Sequence[int], drive: str | None) -> list[str]:
     return ["[can]", "bitrate = 1_000_000", *path, *several, ""]
 
 
-def _buses(groups: Sequence[int], drive: str | None) -> list[list[int]]:
+def _buses(groups: Sequence[int], room: int) -> list[list[int]]:
     """Returns the number of each robot's bus, group by group."""
-    if sum(groups) <= FIT[drive]:
+    if sum(groups) <= room:
         return [[0] * size for size in groups]
     first, found = 0, []
     for size in groups:
-        found.append([first + robot // FIT[drive] for robot in range(size)])
+        found.append([first + robot // room for robot in range(size)])
         first = found[-1][-1] + 1
     return found
 
@@ -86,12 +110,11 @@ def _claims(groups: Sequence[int]) -> list[str]:
     return lines
 
 
-def _formation(groups: Sequence[int], drive: str | None) -> list[str]:
+def _formation(groups: Sequence[int], buses: Sequence[Sequence[int]]) -> list[str]:
     """Returns the tree: groups side by side, their robots around them."""
     radius = max(hypot(*point) for size in groups for point in _points(size, SIDE))
     apart = round(2 * radius + BETWEEN, 1)
     middles = _points(len(groups), apart, groups)
-    buses = _buses(groups, drive)
     several = max(map(max, buses)) > 0
     lines = [
         "# The tree: a formation of groups, groups of robots.  Shapes are wanted, starts are where robots are at first."

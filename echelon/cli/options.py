@@ -5,7 +5,7 @@ and `| None` means that it may be left out.  A field without a default must be g
 """
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from types import UnionType
 from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin
@@ -43,16 +43,37 @@ class Command(Generic[Options]):
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _Choices:
+    """What may be typed for an option.  It is asked for when something was typed, or is to be completed."""
+
+    ask: Callable[[], Sequence[str]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.ask())
+
+    def __contains__(self, typed: object) -> bool:
+        return typed in self.ask()
+
+
 def argument(text: str, metavar: str) -> dict[str, Any]:
     """Returns the metadata of a field that is given by its place: its help, and what stands for it there."""
-    return {"text": text, "metavar": metavar, "flag": None, "parse": None}
+    return {"text": text, "metavar": metavar, "flag": None, "parse": None, "choices": None}
 
 
-def option(text: str, metavar: str | None = None, *, flag: str = "", parse: Parse | None = None) -> dict[str, Any]:
+def option(
+    text: str,
+    metavar: str | None = None,
+    *,
+    flag: str = "",
+    parse: Parse | None = None,
+    choices: Callable[[], Sequence[str]] | None = None,
+) -> dict[str, Any]:
     """Returns the metadata of a field that is given by `--name`, or by `flag`.
 
-    `parse` makes the value of what was typed, where the type alone would take too much.  It raises ValueError."""
-    return {"text": text, "metavar": metavar, "flag": flag, "parse": parse}
+    `parse` makes the value of what was typed, where the type alone would take too much.  It raises ValueError.  `choices`
+    returns what may be typed, where it takes long to know that."""
+    return {"text": text, "metavar": metavar, "flag": flag, "parse": parse, "choices": choices}
 
 
 def _add(parser: ArgumentParser, one: "Field[Any]") -> None:
@@ -62,6 +83,8 @@ def _add(parser: ArgumentParser, one: "Field[Any]") -> None:
     settings: dict[str, Any] = {"help": _help(one)}
     if kind is bool:
         settings["action"] = "store_true"
+    elif one.metadata["choices"] is not None:
+        settings |= {"choices": _Choices(one.metadata["choices"]), "metavar": one.metadata["metavar"]}
     elif get_origin(kind) is Literal:
         settings |= {"choices": get_args(kind), "metavar": one.metadata["metavar"]}
     else:

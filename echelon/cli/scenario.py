@@ -43,6 +43,13 @@ def scenarios(options: ScenariosOptions) -> int:
     return 0
 
 
+def _protocols() -> tuple[str, ...]:
+    """Returns the drive protocols that are built in."""
+    from echelon.bridge.protocols import PROTOCOLS
+
+    return tuple(PROTOCOLS)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NewOptions:
     """Options of `echelon new`."""
@@ -52,11 +59,13 @@ class NewOptions:
         default="2x3",
         metadata=option("groups and robots in each (2x3), or the sizes of unequal groups (2,3,5)", "SIZES"),
     )
-    drive: Literal["native", "odrive", "cia402"] | None = field(
+    drive: str | None = field(
         default=None,
         metadata=option(
             "close the torque path over virtual drives that speak this protocol; otherwise torques are only shown on "
-            "the bus, in native frames"
+            "the bus",
+            "PROTOCOL",
+            choices=_protocols,
         ),
     )
     force: bool = field(default=False, metadata=option("replace a file that is there already"))

@@ -59,17 +59,20 @@ REGISTRY: Final = PatientRegistry(
 """All groups of parts, with what is built in."""
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
+def load(path: Path, overrides: Sequence[str] = (), *, trial: bool = True) -> tuple[Scenario, Plan]:
     """Reads a scenario file, applies overrides `key=value`, makes its plan, and tries the parts in it that others wrote.
 
-    Raises ScenarioError."""
-    return _tried(str(path), *echelon.loading.load(path, overrides, REGISTRY))
+    Without a `trial`, what a run left can be read whatever its parts do.  Raises ScenarioError."""
+    loaded = echelon.loading.load(path, overrides, REGISTRY)
+    return _tried(str(path), *loaded) if trial else loaded
 
 
-def parse(text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path()) -> tuple[Scenario, Plan]:
-    """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, `folder` holds files that the text
-    names.  Raises ScenarioError."""
-    return _tried(name, *echelon.loading.parse(text, name, overrides, REGISTRY, folder))
+def parse(
+    text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path(), *, trial: bool = True
+) -> tuple[Scenario, Plan]:
+    """Does the same with TOML text; `name` stands for the file in messages, `folder` holds files that the text names."""
+    loaded = echelon.loading.parse(text, name, overrides, REGISTRY, folder)
+    return _tried(name, *loaded) if trial else loaded
 
 
 def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:

@@ -24,7 +24,7 @@ FRAMES: Final = 18
 def open_run(folder: Path) -> Run:
     """Opens the folder that a run left.  Raises UserError."""
     try:
-        _, plan = load(folder / EFFECTIVE)
+        _, plan = load(folder / EFFECTIVE, trial=False)
         summary = read_summary(folder / "summary.json")
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None

@@ -54,6 +54,7 @@ class RobotChannel:
         self.commands = 0
         self.largest = 0.0
         self._gave = False
+        self._came_up_ns: int | None = None
         self.spoken = False
         """True once the robot has said something"""
         self.torque_frames = 0
@@ -66,6 +67,8 @@ class RobotChannel:
         # What a host sends first when drives take torque (again) is zero, whatever is wanted; limits count from there.
         enabled = host.enabled
         gives, self._gave = enabled and self._gave, enabled
+        if enabled and self._came_up_ns is None:
+            self._came_up_ns = time_ns
         tau_right = tau_left = 0.0
         limited = False
         if heard is None or (values := heard.values.tolist())[_COMMANDED] != 1.0:
@@ -114,6 +117,7 @@ class RobotChannel:
             stopped=dict(sorted(self.stopped.items())),
             largest=self.largest,
             refused=dict(sorted(self.host.refused.items())),
+            came_up=None if self._came_up_ns is None else self._came_up_ns / 1e9,
             enabled=self.host.enabled,
             fault=self.host.fault,
         )

@@ -104,6 +104,8 @@ class WheelsReport:
     """Periods without torques between two that had them"""
     refused: Mapping[str, int] = field(default_factory=dict)
     """Frames of the drives that were refused, by reason"""
+    came_up: float | None = None
+    """When both wheels first took torque [s]; None: never, or no drive answers"""
     enabled: bool | None = None
     """At the end of the run; None where no drive answers"""
     fault: str = ""

@@ -155,12 +155,33 @@ class LinkPlan:
 
 @dataclass(frozen=True, slots=True)
 class ClaimPlan:
-    """What the run is expected to show: every block of `block` (a name or a layer) stays within `band` of its largest
-    error from `settled_by` [s] on."""
+    """What the run is expected to show: from `settled_by` [s] on, every block of `block` (a name or a layer) stays within
+    `band` of the error that it starts with, to the end and for `dwell` time scales at least (None: as `HealthPlan` says)."""
 
     block: str
     settled_by: float
     band: float
+    dwell: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class HealthPlan:
+    """What every run is checked for, whatever it claims (docs/architecture.md, 6.5)."""
+
+    off: frozenset[str]
+    """Names of checks that are left out"""
+    dwell: float | None
+    """How long an error must stay in its band until the end to be settled, in time scales of its block; None: 3/√k1"""
+    floor: float
+    """Errors up to this are not judged [m]"""
+    growth: float
+    """Largest ratio of an error in the last sixth of the run to that in the sixth before"""
+    saturation: float
+    """Largest share of the time in which a robot's limits act"""
+    silence: float
+    """Longest time in which a robot says nothing [s]"""
+    late: float
+    """Largest share of late stages"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +207,7 @@ class Plan:
     links: tuple[LinkPlan, ...]
     can: CanPlan
     claims: tuple[ClaimPlan, ...]
+    health: HealthPlan
     events: tuple[EventPlan, ...] = ()
     bus_roles: tuple[BusRolePlan, ...] = ()
     """The bridge, then the virtual drives if there are any, where the torque path is closed (`can.closed`); otherwise

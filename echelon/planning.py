@@ -24,6 +24,7 @@ from echelon.plan import (
     AvoidancePlan,
     BlockPlan,
     ClaimPlan,
+    HealthPlan,
     LinkPlan,
     NodePlan,
     Plan,
@@ -90,7 +91,8 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         avoidance=AvoidancePlan(**scenario.avoidance.model_dump()),
         links=links,
         can=can,
-        claims=tuple(ClaimPlan(claim.block, claim.settled_by, claim.band) for claim in scenario.claims),
+        claims=tuple(ClaimPlan(claim.block, claim.settled_by, claim.band, claim.dwell) for claim in scenario.claims),
+        health=HealthPlan(**scenario.health.model_dump() | {"off": frozenset(scenario.health.off)}),
         events=events,
         bus_roles=bus_roles,
     )

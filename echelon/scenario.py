@@ -270,7 +270,58 @@ class Claim(Table):
     settled_by: Positive
     """When its error is to be settled [s of run time]"""
     band: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.05
-    """Settled means: stays within this fraction of the block's largest error"""
+    """Settled means: stays within this fraction of the error that the block starts with, to the end of the run.  That is its
+    largest error within the first 3 σ/√k1 (k1: the smallest gain of its error); a block that starts within `health.floor` must
+    stay there"""
+    dwell: NonNegative | None = None
+    """For how long, at least, it must stay there until the run ends, in multiples of the block's time scale σ; `health.dwell`
+    unless given"""
+
+
+CheckName = Literal[
+    "whole",
+    "finite",
+    "growth",
+    "end",
+    "distance",
+    "avoidance",
+    "saturation",
+    "messages",
+    "silence",
+    "refused",
+    "late",
+    "drives",
+    "referee",
+    "recording",
+]
+
+
+class Health(Table):
+    """The checks that every run is put to, whatever it claims.
+
+    `whole`: the run reaches its end.  `finite`: all states are finite numbers.  `growth`: no error grows in the last third of
+    the run.  `end`: no block ends with a larger error than it started with.  `distance`, where robots do not avoid each
+    other: they keep `avoidance.avoidance_radius` all the same.  `avoidance`, where they do: they keep it, and avoidance had
+    something to do. `saturation`: no robot's limits act for too long.  `messages`: something arrives, and is used, over every
+    link.  `silence`: no robot says nothing for too long.  `refused`: no message is refused.  `late`, on a wall clock: stages
+    run in time.  `drives`, where the torque path is closed: all drives come up, and none is in fault at the end that the
+    scenario has no event for. `referee`: nothing on the bus breaks the contract.  `recording`: it lacks nothing"""
+
+    off: list[CheckName] = []
+    """Checks that this scenario is not put to"""
+    dwell: NonNegative | None = None
+    """For how long an error must stay in its band until the run ends to count as settled, in multiples of the block's time
+    scale σ; 3/√k1 unless given, nearly half a period of its own oscillation"""
+    floor: Positive = 0.001
+    """Errors up to this are not judged, nor need a block that starts within it get closer [m]"""
+    growth: Annotated[float, Field(strict=True, ge=1, allow_inf_nan=False)] = 1.05
+    """How many times as large an error may be in the last sixth of the run as in the sixth before"""
+    saturation: Fraction = 0.2
+    """Share of the time in which a robot's limits may act"""
+    silence: Seconds = 0.5
+    """For how long a robot may say nothing [s]; at least two of its periods"""
+    late: Fraction = 0.1
+    """Share of the stages that may run at their deadline without something they wanted, on a wall clock"""
 
 
 class Scenario(Table):
@@ -305,5 +356,7 @@ class Scenario(Table):
     """The recording"""
     claims: list[Claim] = []
     """What the run is expected to show"""
+    health: Health = Health()
+    """Checks that every run is put to, whatever it claims"""
     events: list[Event] = []
     """What happens on schedule, in run time"""

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Final
 
-from echelon.bridge.reports import CanReport
+from echelon.bridge.reports import CanReport, RefereeReport
 
 SHOWN: Final = 5
 """How many of many are listed."""
@@ -27,30 +27,30 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
         yield f"  CAN      {', '.join(facts)}"
         yield from (f"  bus      {line}" for line in can.fit)
     if can.scheduled:
-        yield f"  events   {_some([f'{event.time:g} s {event.what}' for event in can.scheduled])}"
+        yield f"  events   {some([f'{event.time:g} s {event.what}' for event in can.scheduled])}"
     if off := [event for bus in can.buses for event in bus.events if event.event == "bus-off"]:
-        yield f"  bus-off  {_some([f'{event.who} at {event.time:.4g} s' for event in off])}"
+        yield f"  bus-off  {some([f'{event.who} at {event.time:.4g} s' for event in off])}"
     if can.stopped:
         reasons = ", ".join(f"{number} {reason}" for reason, number in islice(can.stopped.items(), SHOWN))
         yield f"  stopped  torques that became zero before the bus: {reasons}"
     if faults := [f"{name} {row.fault}" for name, row in can.robots.items() if row.fault]:
-        yield f"  drives   faults at the end: {_some(faults)}"
+        yield f"  drives   faults at the end: {some(faults)}"
     if idle := [name for name, row in can.robots.items() if row.enabled is False and not row.fault]:
-        yield f"  drives   not enabled at the end: {_some(idle)}"
+        yield f"  drives   not enabled at the end: {some(idle)}"
     if can.referee is not None:
         found = ", ".join(f"{number} {kind}" for kind, number in can.referee.kinds.items()) or "nothing wrong"
         yield f"  referee  {can.referee.frames} frames: {found}"
 
 
-def can_reasons(can: CanReport | None) -> list[str]:
-    """Returns why the verdict fails for what was on the bus: the referee's findings."""
-    if can is None or can.referee is None or not can.referee.kinds:
-        return []
-    total, first = sum(can.referee.kinds.values()), can.referee.findings[0]
+def finding_text(referee: RefereeReport) -> str:
+    """Returns how many findings there are, and the first one."""
+    first = referee.findings[0]
     what = " ".join(filter(None, (first.bus, first.id, first.robot, first.kind)))
-    return [f"referee: {total} finding(s) on the bus, the first at {first.time:.6g} s, {what}: {first.text}"]
+    total = sum(referee.kinds.values())
+    return f"{total} finding(s) on the bus, the first at {first.time:.6g} s, {what}: {first.text}"
 
 
-def _some(texts: Sequence[str]) -> str:
+def some(texts: Sequence[str]) -> str:
+    """Returns texts as a list in words, the first few of many."""
     more = f", and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
     return ", ".join(texts[:SHOWN]) + more

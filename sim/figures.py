@@ -29,7 +29,7 @@ from echelon.sim.drawing import (
 )
 from echelon.sim.results.blocks import Blocks, BlockSeries
 from echelon.sim.results.distances import Distances, distances
-from echelon.sim.results.measures import settling_ns
+from echelon.sim.results.settling import settle
 from echelon.sim.results.trace import Trace
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ def errors(blocks: Blocks, plan: Plan, width: float) -> str:
             times, norm = thin(blocks.times_ns, np.where(series.norm > 0, series.norm, np.nan), log=True)
             axes.plot(times, norm, color=colour, lw=1.3, zorder=3, label=series.block.name)
             for fraction, face in ((0.05, colour), (0.02, "white")):
-                settled = settling_ns(blocks.times_ns, series.norm, fraction)
+                settled = settle(plan, series, blocks.times_ns, fraction).settled_ns
                 if settled:
                     at = int(np.searchsorted(blocks.times_ns, settled))
                     axes.plot(

@@ -7,6 +7,8 @@ from typing import Final
 from echelon.sim.results.records import Summary
 from echelon.sim.results.summary import number
 
+OUTCOMES: Final = {"passed": "holds", "failed": "fails", "not tested": "quiet"}
+"""How the outcome of a check is marked in a table"""
 LONG: Final = 24
 """A table's text of more characters may take several lines."""
 STYLE: Final = """
@@ -94,14 +96,13 @@ def figure(svg: str, alternative: str, caption: str) -> str:
 
 
 def verdict(name: str, summary: Summary) -> str:
-    """Returns a run's verdict with its reasons."""
-    holds, reasons = summary.verdict.holds, summary.verdict.reasons
-    kind, word = ("", "The verdict holds") if holds else (" fails", "The verdict fails")
-    listed = "".join(f"<li>{escape(str(reason))}</li>" for reason in reasons)
-    claims = len(summary.claims)
-    good = f"; {claims} claim{'s' * (claims != 1)} held" if holds and claims else ""
+    """Returns a run's verdict with its reasons, and what was not tested."""
+    found = summary.verdict
+    listed = "".join(f"<li>{escape(reason)}</li>" for reason in found.reasons)
+    listed += "".join(f'<li class="quiet">not tested: {escape(text)}</li>' for text in found.not_tested)
+    what = found.sentence.partition(": ")[2]
     return (
-        f'<div class="verdict{kind}"><b>{word}</b> — {escape(name)}{good}.'
+        f'<div class="verdict{" fails" if found.fails else ""}"><b>{found.word}</b> — {escape(name)}: {escape(what)}.'
         + (f"<ul>{listed}</ul>" if listed else "")
         + "</div>"
     )
@@ -125,6 +126,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: i
     def cell(at: int, value: object) -> str:
         if isinstance(value, bool):
             return f'<td class="mark {"holds" if value else "fails"}">{"holds" if value else "fails"}</td>'
+        if value in OUTCOMES:
+            return f'<td class="mark {OUTCOMES[str(value)]}">{value}</td>'
         text = number(value) if isinstance(value, float) or value is None else str(value)
         kind = " class=n" if at >= numeric_from else " class=w" if len(text) > LONG else ""
         return f"<td{kind}>{escape(text)}</td>"

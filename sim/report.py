@@ -78,7 +78,10 @@ def write_report(runs: Sequence[RunForReport], path: Path) -> None:
 
 def _parts(title: str, shown: Sequence[_Shown]) -> list[str]:
     runs = [one.run for one in shown]
-    settled = "Settled: from then on the error stays within the band, a share of its largest value."
+    settled = (
+        "Settled: from then on to the end, and for its dwell time at least, the error stays within the band, a share of the "
+        "error that the block starts with."
+    )
     integrals = "Settling in seconds, errors in metres; the integrals are of the error's norm over the run."
 
     def each(cell: Callable[[_Shown], str]) -> list[str]:
@@ -126,7 +129,7 @@ def _named(one: _Shown) -> str:
 def _tiles(one: _Shown) -> str:
     summary = one.run.summary
     peak = max((row.peak for row in summary.torque if row.peak is not None), default=None)
-    values = [(f"{claim.block} settled", number(claim.measured, "s", "never")) for claim in summary.claims]
+    values = [(f"{claim.block} settled", number(claim.measured, "s", "not")) for claim in summary.claims]
     values.append(("smallest distance", number(summary.distance.smallest, "m")))
     values.append(("largest torque", _engineering(peak, "N m")))
     values.append(("of real time", number(summary.run.real_time_factor, "×")))
@@ -140,7 +143,7 @@ def _claims(runs: Sequence[RunForReport]) -> str:
         for run in runs:
             others = run.summary.claims
             same = at < len(others) and others[at].block == claim.block
-            row += [number(others[at].measured, "s", "never"), others[at].holds] if same else [None, None]
+            row += [number(others[at].measured, "s"), others[at].outcome] if same else [None, None]
         rows.append(row)
     if not rows:
         return paragraph("The scenario makes no claims.")
@@ -149,9 +152,12 @@ def _claims(runs: Sequence[RunForReport]) -> str:
 
 
 def _separation(one: _Shown) -> str:
-    head = ["slower over faster", "σ ratio", "settling ratio, 5 %", "2 %"]
+    head = ["slower over faster", "σ ratio", "decay rates", "r²", "settling, 5 %", "2 %"]
     rows: list[list[object]] = [
-        [f"{row.slower} over {row.faster}", row.sigma_ratio, row.settling_5_ratio, row.settling_2_ratio]
+        [
+            *(f"{row.slower} over {row.faster}", row.sigma_ratio, row.rate_ratio, row.rate_fit),
+            *(row.settling_5_ratio, row.settling_2_ratio),
+        ]
         for row in one.run.summary.separation
     ]
     return table(head, rows) if rows else ""
@@ -179,18 +185,43 @@ def _transformed(one: _Shown) -> str:
 
 
 def _errors(one: _Shown) -> str:
-    settled = ", ".join(f"{row.name} {number(row.settling_5, 's', 'never')}" for row in one.run.summary.blocks)
+    settled = ", ".join(f"{row.name} {number(row.settling_5, 's', 'not')}" for row in one.run.summary.blocks)
     return figure(
         errors(one.blocks, one.run.trace.plan, one.width),
         f"Error norm of every block over time, both axes logarithmic. Settled to 5 %: {settled}.",
-        "Error norm of every block. Filled dot: settled to 5 % of its largest value; open dot: to 2 %. Dashed: claims.",
+        "Error norm of every block. Filled dot: settled to 5 % of what it starts with; open dot: to 2 %. Dashed: claims.",
     )
 
 
 def _blocks(one: _Shown) -> str:
-    head = ["block", "σ [s]", "5 %", "2 %", "peak", "residual", "ISE", "IAE", "ITAE"]
-    keys = ("name", "sigma", "settling_5", "settling_2", "peak_error", "residual", "ise", "iae", "itae")
-    return table(head, [[getattr(row, key) for key in keys] for row in one.run.summary.blocks])
+    head = [
+        "block",
+        "σ [s]",
+        "5 %",
+        "2 %",
+        "decay [1/s]",
+        "start",
+        "peak",
+        "residual",
+        "ISE",
+        "IAE",
+        "ITAE",
+        "in the end",
+    ]
+    keys = (
+        "name",
+        "sigma",
+        "settling_5",
+        "settling_2",
+        "decay_rate",
+        "start_error",
+        "peak_error",
+        "residual",
+        "ise",
+        "iae",
+    )
+    rows = one.run.summary.blocks
+    return table(head, [[*(getattr(row, key) for key in keys), row.itae, row.remark] for row in rows])
 
 
 def _distances(one: _Shown) -> str:
@@ -201,11 +232,7 @@ def _distances(one: _Shown) -> str:
         f"Smallest distance between robots over time; the smallest is {number(distance.smallest, 'm')}.",
         "Smallest distance of all pairs; between recorded instants robots are taken to move straight. Circle: the "
         "closest encounter. Tinted: closer than the avoidance radius rₐ. Rₛ: sensing radius."
-        + (
-            ""
-            if distance.avoidance_enabled
-            else " Avoidance is not enabled: violations are reported, but fail nothing."
-        ),
+        + ("" if distance.avoidance_enabled else " Avoidance is not enabled: robots keep out of it by chance."),
     )
     if not violations:
         return drawn + paragraph("No pair came within the avoidance radius.")

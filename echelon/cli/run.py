@@ -77,7 +77,7 @@ def run(options: RunOptions) -> int:
     if failure := finished.failure or finished.report_failure:
         print(f"echelon: {failure}", file=sys.stderr)
         return 3
-    return 0 if finished.holds else 1
+    return 1 if finished.verdict.fails else 0
 
 
 COMMANDS: Final = (
@@ -96,6 +96,6 @@ Given the folder of a run, it runs that scenario again, into a new folder.""",
             "echelon run runs/demo --set duration=1.0": "the scenario of an earlier run again",
             "echelon run - --quiet --json < my.toml": "from a script",
         },
-        codes={0: "the verdict holds", 1: "the verdict fails"},
+        codes={0: "HOLDS, or HEALTHY where nothing is claimed", 1: "FAILS"},
     ),
 )

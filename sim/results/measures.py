@@ -1,6 +1,6 @@
 """What is measured of a run: settling, error integrals, separation, claims, distances, torque, links."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import isfinite
 from typing import Final, SupportsFloat
 
@@ -10,52 +10,47 @@ from numpy.typing import NDArray
 from echelon.bridge.frame import WHEELS
 from echelon.link import LinkCounts
 from echelon.messages import STATE_FIELDS
-from echelon.plan import BlockPlan, Plan
+from echelon.plan import Plan
 from echelon.sim.results.blocks import Blocks, BlockSeries
 from echelon.sim.results.distances import Distances
+from echelon.sim.results.ending import Ending
 from echelon.sim.results.records import (
     BlockResult,
     ClaimResult,
     DistanceResult,
     LinkResult,
+    Outcome,
     SeparationResult,
     TorqueResult,
     ViolationResult,
 )
+from echelon.sim.results.settling import Settling, settle, start_error
 from echelon.sim.results.trace import Array, Trace
 
-ROUNDING: Final = 1e-9
-"""Errors up to this [m] are rounding: a block within it is settled, however small its largest error was."""
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart: the step at the start is its usual cause."""
 
 
-def settling_ns(times_ns: NDArray[np.int64], norm: Array, fraction: float) -> int | None:
-    """Returns the first instant [ns] from which on |e| stays within `fraction` of its largest value to the end, or None
-    if the last |e| is outside, some |e| is not finite, or there is none.
-
-    norm is |e| (T,) [m] at times_ns (T,); the answer is one of these instants: the one after the last that is outside.
-    """
-    if not len(norm) or not np.isfinite(norm).all():
-        return None
-    outside = np.flatnonzero(norm > max(fraction * float(norm.max()), ROUNDING))
-    if not outside.size:
-        return int(times_ns[0])
-    after = int(outside[-1]) + 1
-    return int(times_ns[after]) if after < len(norm) else None
-
-
-def block_result(series: BlockSeries, times_ns: NDArray[np.int64]) -> BlockResult:
-    """Returns a block's settling times, peak, residual and error integrals."""
+def block_result(plan: Plan, series: BlockSeries, times_ns: NDArray[np.int64], ending: Ending) -> BlockResult:
+    """Returns a block's settling times, decay, ending, peak, residual and error integrals."""
     norm, seconds = series.norm, times_ns / 1e9
     largest = int(np.argmax(norm)) if len(norm) else None
+    to_2, to_5 = (settle(plan, series, times_ns, fraction) for fraction in (0.02, 0.05))
     with np.errstate(all="ignore"):
         return BlockResult(
             name=series.block.name,
             layer=series.block.layer,
             sigma=series.block.sigma,
-            settling_2=_seconds(settling_ns(times_ns, norm, 0.02)),
-            settling_5=_seconds(settling_ns(times_ns, norm, 0.05)),
+            start_error=start_error(series, times_ns),
+            dwell=to_5.dwell_ns / 1e9,
+            settling_2=_seconds(to_2.settled_ns),
+            band_2=to_2.band,
+            settling_5=_seconds(to_5.settled_ns),
+            band_5=to_5.band,
+            decay_rate=None if ending.fit is None else ending.fit.rate,
+            decay_fit=None if ending.fit is None else ending.fit.r_squared,
+            ending=ending.kind,
+            remark=ending.text,
             residual=None if largest is None else _finite(norm[-1]),
             peak_error=None if largest is None else _finite(norm[largest]),
             peak_time=None if largest is None else float(seconds[largest]),
@@ -65,62 +60,102 @@ def block_result(series: BlockSeries, times_ns: NDArray[np.int64]) -> BlockResul
         )
 
 
-def separation_results(blocks: Blocks) -> tuple[SeparationResult, ...]:
+def separation_results(rows: Sequence[BlockResult], blocks: Blocks) -> tuple[SeparationResult, ...]:
     """Returns each time scale σ compared with the next faster: a layer, or blocks where each has its own scale."""
-    scales: dict[float, list[BlockSeries]] = {}
-    for series in blocks.series:
-        if series.block.size:
-            scales.setdefault(series.block.sigma, []).append(series)
-    layers = [series.block.layer for series in blocks.series if series.block.size]
+    shown = [row for row, series in zip(rows, blocks.series, strict=True) if series.block.size]
+    scales: dict[float, list[BlockResult]] = {}
+    for row in shown:
+        scales.setdefault(row.sigma, []).append(row)
+    layers = [row.layer for row in shown]
     ordered = sorted(scales.items())
     return tuple(
         SeparationResult(
             faster=_scale_name(fast, layers),
             slower=_scale_name(slow, layers),
             sigma_ratio=slow_sigma / fast_sigma,
-            settling_2_ratio=_settling_ratio(blocks, slow, fast, 0.02),
-            settling_5_ratio=_settling_ratio(blocks, slow, fast, 0.05),
+            rate_ratio=_rate_ratio(slow, fast),
+            rate_fit=min((row.decay_fit for row in (*slow, *fast) if row.decay_fit is not None), default=None),
+            settling_2_ratio=_ratio([row.settling_2 for row in slow], [row.settling_2 for row in fast]),
+            settling_5_ratio=_ratio([row.settling_5 for row in slow], [row.settling_5 for row in fast]),
         )
         for (fast_sigma, fast), (slow_sigma, slow) in zip(ordered, ordered[1:], strict=False)
     )
 
 
-def _settling_ratio(blocks: Blocks, slow: list[BlockSeries], fast: list[BlockSeries], band: float) -> float | None:
-    late, soon = (_slowest(settling_ns(blocks.times_ns, one.norm, band) for one in scale) for scale in (slow, fast))
+def _rate_ratio(slow: Sequence[BlockResult], fast: Sequence[BlockResult]) -> float | None:
+    """Returns how many times as fast the slowest of the fast blocks decays as the slowest of the slow ones."""
+    times = [
+        [1 / row.decay_rate if row.decay_rate and row.decay_rate > 0 else None for row in rows] for rows in (slow, fast)
+    ]
+    return _ratio(*times)
+
+
+def _ratio(slow: Sequence[float | None], fast: Sequence[float | None]) -> float | None:
+    late, soon = _slowest(slow), _slowest(fast)
     return None if late is None or not soon else late / soon
 
 
-def _scale_name(scale: list[BlockSeries], layers: list[str]) -> str:
-    layer = scale[0].block.layer
-    whole = all(series.block.layer == layer for series in scale) and len(scale) == layers.count(layer)
-    return layer if whole else ", ".join(series.block.name for series in scale)
+def _scale_name(scale: Sequence[BlockResult], layers: Sequence[str]) -> str:
+    layer = scale[0].layer
+    whole = all(row.layer == layer for row in scale) and len(scale) == layers.count(layer)
+    return layer if whole else ", ".join(row.name for row in scale)
 
 
-def claim_results(plan: Plan, blocks: Blocks) -> tuple[ClaimResult, ...]:
-    """Returns each claim held against the slowest of its blocks."""
+def claim_results(plan: Plan, blocks: Blocks, endings: Sequence[Ending]) -> tuple[tuple[ClaimResult, str], ...]:
+    """Returns each claim, held against the slowest of its blocks, with a sentence about it."""
+    end_ns = int(blocks.times_ns[-1]) if len(blocks.times_ns) else None
+    if end_ns is not None and end_ns >= plan.duration_ns - plan.root.period_ns:
+        end_ns = plan.duration_ns  # the last instant that all robots share may be one period before
     results = []
     for claim in plan.claims:
-        times = {
-            series.block.name: settling_ns(blocks.times_ns, series.norm, claim.band)
-            for series in blocks.series
-            if _claimed(claim.block, series.block)
-        }
+        by_ns = round(claim.settled_by * 1e9)
+        found = [
+            (series.block.name, settle(plan, series, blocks.times_ns, claim.band, claim.dwell), ending)
+            for series, ending in zip(blocks.series, endings, strict=True)
+            if claim.block in ("*", series.block.name, series.block.layer)
+        ]
+        times = {name: _seconds(settling.settled_ns) for name, settling, _ in found}
         measured = _slowest(times.values())
+        told = [_told(name, settling, ending, by_ns) for name, settling, ending in found]
+        outcome: Outcome
+        if end_ns is None or by_ns > end_ns:
+            ended = "nothing was simulated" if end_ns is None else f"the run ended at {end_ns / 1e9:g} s"
+            outcome, why = "not tested", ended
+        else:
+            outcome, why = min(told, key=lambda one: ("failed", "not tested", "passed").index(one[0]))
+        if outcome == "passed" and measured is not None:
+            slowest = max(found, key=lambda one: times[one[0]] or 0.0)
+            why = f"{slowest[0]} as the last at {measured:.6g} s, to {slowest[1].band:.3g} m" if len(found) > 1 else why
         results.append(
-            ClaimResult(
-                block=claim.block,
-                settled_by=claim.settled_by,
-                band=claim.band,
-                measured=_seconds(measured),
-                blocks={name: _seconds(time) for name, time in times.items()},
-                holds=measured is not None and measured <= round(claim.settled_by * 1e9),
+            (
+                ClaimResult(
+                    block=claim.block,
+                    settled_by=claim.settled_by,
+                    band=claim.band,
+                    measured=measured,
+                    blocks=times,
+                    bands={name: settling.band for name, settling, _ in found},
+                    outcome=outcome,
+                ),
+                f"{claim.block} within {100 * claim.band:g} % by {claim.settled_by:g} s: {why}",
             )
         )
     return tuple(results)
 
 
-def _claimed(name: str, block: BlockPlan) -> bool:
-    return name in ("*", block.name, block.layer)
+def _told(name: str, settling: Settling, ending: Ending, by_ns: int) -> tuple[Outcome, str]:
+    """Returns whether a block settled in time, and what it did, in words."""
+    entered_ns, band = settling.entered_ns, f"{settling.band:.3g} m"
+    if entered_ns is None:
+        return "failed", f"{name} did not settle to {band}: it {ending.text}"
+    if entered_ns > by_ns:
+        return "failed", f"{name} took {entered_ns / 1e9:.6g} s, to {band}"
+    if settling.settled_ns is None:
+        stayed_s, dwell_s = (settling.end_ns - entered_ns) / 1e9, settling.dwell_ns / 1e9
+        return "not tested", (
+            f"{name} was within {band} from {entered_ns / 1e9:.6g} s on, for {stayed_s:.4g} s; it must stay for {dwell_s:.4g} s"
+        )
+    return "passed", f"{name} took {entered_ns / 1e9:.6g} s, to {band}"
 
 
 def distance_result(plan: Plan, near: Distances) -> DistanceResult:
@@ -201,13 +236,13 @@ def link_result(plan: Plan, counts: LinkCounts) -> LinkResult:
         in_flight=counts.in_flight,
         used=counts.used,
         held=counts.held,
-        age_mean=counts.age_mean_ns / 1e9,
-        age_max=counts.age_max_ns / 1e9,
+        age_mean=counts.age_mean_ns / 1e9 if counts.used else None,
+        age_max=counts.age_max_ns / 1e9 if counts.used else None,
     )
 
 
-def _slowest(times: Iterable[int | None]) -> int | None:
-    """Returns the latest settling time, None if one of them did not settle."""
+def _slowest(times: Iterable[float | None]) -> float | None:
+    """Returns the longest of some times, None if there is none, or one of them is none."""
     known = list(times)
     return None if None in known or not known else max(time for time in known if time is not None)
 

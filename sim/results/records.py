@@ -6,20 +6,91 @@ the settling time of a block that did not settle.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final, Literal
 
 from echelon.bridge.reports import CanReport
 
-FORMAT = 2
+FORMAT: Final = 3
 """Of summary.json; one more whenever a key changes its meaning or goes"""
+Outcome = Literal["passed", "failed", "not tested"]
+CLAIM: Final = "claim"
+"""Name of the checks that are claims of the scenario"""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """One thing that was looked at, with its outcome."""
+
+    name: str
+    """`claim`, or one of the health checks of docs/scenario.md"""
+    outcome: Outcome
+    text: str
+    """One sentence"""
+    measured: float | None = None
+    """What was measured; None where it is no number, or there is none"""
+    unit: str = ""
+    """Of what was measured and of its bound"""
+    bound: float | None = None
+    about: tuple[str, ...] = ()
+    """Blocks, robots or links that it is about; empty: the whole run"""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the run showed what it claims, and nothing went wrong."""
+    """What a run showed.  HOLDS: it claimed something, all claims passed, and no check failed.  HEALTHY: it claimed nothing,
+    and no check failed.  FAILS: everything else."""
 
-    holds: bool
-    reasons: tuple[str, ...]
-    """Why it does not hold"""
+    word: Literal["HOLDS", "HEALTHY", "FAILS"]
+    checks: tuple[CheckResult, ...]
+
+    @property
+    def fails(self) -> bool:
+        """True if the word is FAILS."""
+        return self.word == "FAILS"
+
+    @property
+    def claims(self) -> tuple[CheckResult, ...]:
+        """The checks that are claims of the scenario."""
+        return tuple(check for check in self.checks if check.name == CLAIM)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the run fails: the sentences of what failed, and of claims that were not tested."""
+        return tuple(
+            f"{check.name}: {check.text}"
+            for check in self.checks
+            if check.outcome == "failed" or (check.outcome == "not tested" and check.name == CLAIM)
+        )
+
+    @property
+    def not_tested(self) -> tuple[str, ...]:
+        """The sentences of what could not be tested, claims left out."""
+        return tuple(
+            f"{check.name}: {check.text}"
+            for check in self.checks
+            if check.outcome == "not tested" and check.name != CLAIM
+        )
+
+    @property
+    def sentence(self) -> str:
+        """The word, and what it stands on."""
+        claims, others = len(self.claims), [check.outcome for check in self.checks if check.name != CLAIM]
+        passed = f"{count(others.count('passed'), 'check')} passed"
+        match self.word:
+            case "HOLDS":
+                return f"HOLDS: {count(claims, 'claim')} and {passed}"
+            case "HEALTHY":
+                return f"HEALTHY: nothing was claimed; {passed}"
+        failed = f"{count(len(self.reasons), 'reason')}; {passed}"
+        return f"FAILS: {failed}" if claims else f"FAILS: nothing was claimed; {failed}"
+
+    def __str__(self) -> str:
+        return "\n".join([self.sentence, *self.reasons, *(f"not tested: {text}" for text in self.not_tested)])
+
+
+def count(number: int, what: str) -> str:
+    """Returns a number of things in words: `1 claim`, `3 claims`."""
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +100,15 @@ class ClaimResult:
     block: str
     settled_by: float
     band: float
+    """Share of the error that a block starts with"""
     measured: float | None
     """When the slowest of its blocks settled"""
     blocks: Mapping[str, float | None]
     """When each of its blocks settled"""
-    holds: bool
+    bands: Mapping[str, float]
+    """The band of each of its blocks [m]"""
+    outcome: Outcome
+    """`not tested`: the run ended before it could be told"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +119,26 @@ class BlockResult:
     layer: str
     sigma: float
     """Time scale σ [s]"""
+    start_error: float | None
+    """The error that it starts with [m]: its largest |e| within the first response time, 3 σ/√k1"""
+    dwell: float
+    """How long |e| must stay in a band until the end of the run to be settled [s]"""
     settling_2: float | None
-    """From when on |e| stays within 2 % of its largest value"""
+    """From when on |e| stays within `band_2`; None if it does not, or not for the dwell time"""
+    band_2: float
+    """2 % of the error that it starts with, or `health.floor` where it starts within that [m]"""
     settling_5: float | None
+    band_5: float
+    """The same with 5 %"""
+    decay_rate: float | None
+    """Of the error's amplitude, by a line fitted to its logarithm [1/s]; negative where it grows"""
+    decay_fit: float | None
+    """r² of that fit"""
+    ending: str
+    """How |e| ended: `at rest`, `falls`, `grows`, `oscillates`, `steady lag`, `steady error`, `not finite`; or the run is `too
+    short` to tell"""
+    remark: str
+    """The same in words, with numbers"""
     residual: float | None
     """|e| at the end [m]"""
     peak_error: float | None
@@ -67,8 +159,12 @@ class SeparationResult:
     faster: str
     slower: str
     sigma_ratio: float
+    rate_ratio: float | None
+    """Decay rate of the faster over that of the slower, of each the slowest of its blocks; None if one does not decay"""
+    rate_fit: float | None
+    """The smaller r² of the two fits"""
     settling_2_ratio: float | None
-    """Settling time of the slower over that of the faster"""
+    """Settling time of the slower over that of the faster; other than a ratio of time scales, it depends on where they start"""
     settling_5_ratio: float | None
 
 
@@ -134,9 +230,9 @@ class LinkResult:
     """Uses of a message"""
     held: int
     """Uses of a message that had been used before, after the instant it was sent in"""
-    age_mean: float
-    """Of what was in use, at each use [s]"""
-    age_max: float
+    age_mean: float | None
+    """Of what was in use, at each use [s]; None if nothing was ever used"""
+    age_max: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +273,8 @@ class RunFacts:
     messages: int
     failure: str | None
     """Why it broke off"""
+    stopped: str | None = None
+    """Why it was stopped before its end though nothing failed: a state that is not finite"""
     date: str = ""
     """When it began, UTC, ISO 8601"""
     version: str = ""
@@ -192,7 +290,7 @@ class RunFacts:
     latest: float = 0.0
     """Largest lateness of a stage [s] (wall clock)"""
     refused: int = 0
-    """Payloads that were no messages for their receiver"""
+    """Payloads that were no messages for their receiver, or for the recording"""
     resident_bytes: int | None = None
     """Of the one process"""
     resident_bytes_robot_max: int | None = None

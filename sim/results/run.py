@@ -69,8 +69,8 @@ class Run:
 
     @property
     def holds(self) -> bool:
-        """True if the verdict holds."""
-        return self.summary.verdict.holds
+        """True if the run claimed something, and all claims and checks passed."""
+        return self.summary.verdict.word == "HOLDS"
 
     @property
     def failure(self) -> str | None:
@@ -136,13 +136,9 @@ class Run:
         return [*super().__dir__(), *Summary.__slots__]
 
     def __repr__(self) -> str:
-        word = "holds" if self.holds else "fails"
+        simulated = f"{self.summary.simulated:g} s" if self.summary.simulated else "nothing simulated"
         where = f", {self.folder}" if self.folder is not None else ""
-        return (
-            f"<Run of {self.summary.scenario}: {word}, {self.summary.simulated:g} s{where}>"
-            if self.summary.simulated
-            else (f"<Run of {self.summary.scenario}: {word}, nothing simulated{where}>")
-        )
+        return f"<Run of {self.summary.scenario}: {self.summary.verdict.word}, {simulated}{where}>"
 
 
 _PARTS: Final = ("value", "desired", "error", "rate", "error_rate")

@@ -6,10 +6,11 @@ import numpy as np
 
 from echelon.bridge.reports import CanReport
 from echelon.link import LinkCounts
-from echelon.plan import Plan
-from echelon.sim.can_lines import can_lines, can_reasons
+from echelon.sim.can_lines import can_lines
 from echelon.sim.results.blocks import block_series
-from echelon.sim.results.distances import Distances, distances
+from echelon.sim.results.checks import Evidence, verdict
+from echelon.sim.results.distances import distances
+from echelon.sim.results.ending import endings
 from echelon.sim.results.measures import (
     block_result,
     claim_results,
@@ -18,7 +19,7 @@ from echelon.sim.results.measures import (
     separation_results,
     torque_result,
 )
-from echelon.sim.results.records import FORMAT, ClaimResult, PartResult, RunFacts, Summary, Verdict
+from echelon.sim.results.records import FORMAT, PartResult, RunFacts, Summary
 from echelon.sim.results.trace import Trace
 
 
@@ -33,26 +34,29 @@ def summarise(
     plan = trace.plan
     blocks = block_series(trace)
     near = distances(trace)
-    end_ns = int(blocks.times_ns[-1]) if len(blocks.times_ns) else None
-    claims = claim_results(plan, blocks)
-    broken_off = [run.failure.splitlines()[0]] if run.failure else []
-    reasons = [*broken_off, *_broken(trace, end_ns), *_failed(claims), *_too_close(plan, near), *can_reasons(can)]
+    ended = endings(plan, blocks, links)
+    claims = claim_results(plan, blocks, ended)
+    rows = tuple(
+        block_result(plan, series, blocks.times_ns, ending) for series, ending in zip(blocks.series, ended, strict=True)
+    )
+    torque = tuple(torque_result(trace, robot) for robot in range(len(plan.robots)))
+    of_links = tuple(link_result(plan, counts) for counts in links)
     return Summary(
         format=FORMAT,
         scenario=plan.name,
         seed=plan.seed,
         robots=len(plan.robots),
         duration=plan.duration_ns / 1e9,
-        simulated=None if end_ns is None else end_ns / 1e9,
+        simulated=int(blocks.times_ns[-1]) / 1e9 if len(blocks.times_ns) else None,
         instants=len(blocks.times_ns),
         largest_gap=float(np.diff(blocks.times_ns).max()) / 1e9 if len(blocks.times_ns) > 1 else None,
-        verdict=Verdict(not reasons, tuple(reasons)),
-        claims=claims,
-        blocks=tuple(block_result(series, blocks.times_ns) for series in blocks.series),
-        separation=separation_results(blocks),
+        verdict=verdict(Evidence(trace, blocks, ended, near, torque, of_links, can, run), claims),
+        claims=tuple(claim for claim, _ in claims),
+        blocks=rows,
+        separation=separation_results(rows, blocks),
         distance=distance_result(plan, near),
-        torque=tuple(torque_result(trace, robot) for robot in range(len(plan.robots))),
-        links=tuple(link_result(plan, counts) for counts in links),
+        torque=torque,
+        links=of_links,
         can=can,
         run=run,
         trace_digest=trace.digest(),
@@ -66,18 +70,20 @@ def summary_text(summary: Summary) -> str:
 
 
 def _lines(summary: Summary) -> Iterator[str]:
-    yield f"{summary.scenario}: {'HOLDS' if summary.verdict.holds else 'FAILS'}"
+    yield f"{summary.scenario}: {summary.verdict.sentence}"
     yield from (f"  because  {reason}" for reason in summary.verdict.reasons)
-    for claim in summary.claims:
-        what = f"{claim.block} within {100 * claim.band:g} % by {claim.settled_by:g} s"
-        measured, word = number(claim.measured, "s", "not settled"), "holds" if claim.holds else "fails"
-        yield f"  claim    {what}: {measured}, {word}"
+    yield from (f"  untested {text}" for text in summary.verdict.not_tested)
+    yield from (f"  claim    {check.text}" for check in summary.verdict.claims if check.outcome == "passed")
     for block in summary.blocks:
-        settled = f"5 % {number(block.settling_5, 's', 'never'):<9}  2 % {number(block.settling_2, 's', 'never'):<9}"
-        yield f"  block    {block.name:<10} settled to {settled} residual {number(block.residual, 'm')}"
+        if block.settling_5 is None:
+            settled = f"not settled: it {block.remark}"
+        else:
+            within = (number(block.settling_5, "s"), number(block.settling_2, "s"))
+            settled = f"settled to 5 % {within[0]:<9}  2 % {within[1]:<9} residual {number(block.residual, 'm')}"
+        yield f"  block    {block.name:<10} {settled}"
     for row in summary.separation:
-        ratio = f"{number(row.settling_5_ratio)} times the settling (σ: {number(row.sigma_ratio)})"
-        yield f"  scales   {row.slower} over {row.faster}: {ratio}"
+        settled = f"settling {number(row.settling_5_ratio)}, σ {number(row.sigma_ratio)}"
+        yield f"  scales   {row.slower} over {row.faster}: {number(row.rate_ratio)} times as slow ({settled})"
     distance = summary.distance
     if distance.pair:
         where = f"{' and '.join(distance.pair)} at {number(distance.time, 's')}"
@@ -87,7 +93,7 @@ def _lines(summary: Summary) -> Iterator[str]:
         share = max(row.saturation_share or 0.0 for row in summary.torque)
         yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
     sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
-    age = max((link.age_max for link in summary.links), default=0.0)
+    age = max((link.age_max for link in summary.links if link.age_max is not None), default=None)
     yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
     yield from can_lines(summary.can)
     run = summary.run
@@ -102,53 +108,3 @@ def number(value: float | None, unit: str = "", missing: str = "–") -> str:
     if value is None:
         return missing
     return f"{value:.4g} {unit}".rstrip()
-
-
-def _broken(trace: Trace, end_ns: int | None) -> list[str]:
-    """Says what is not finite, and whether the run reached its end: the last instant that all robots share may be one
-    period of the coordinator before it."""
-    plan = trace.plan
-    reasons = []
-    lost: list[tuple[int, str]] = []
-    for robot, states, times_ns in zip(plan.robots, trace.states, trace.times_ns, strict=True):
-        wrong = np.flatnonzero(~np.isfinite(states).all(axis=1))
-        if wrong.size:
-            lost.append((int(times_ns[wrong[0]]), robot.name))
-    if lost:
-        first_ns, name = min(lost)
-        others = f", as of {len(lost)} robots in the end" if len(lost) > 1 else ""
-        reasons.append(f"{name}: a state is not finite from {first_ns / 1e9:g} s on{others}")
-    wanted = plan.duration_ns
-    needed = wanted - plan.root.period_ns
-    early = [
-        f"{robot.name} at {times_ns[-1] / 1e9:g} s" if len(times_ns) else f"{robot.name} before it began"
-        for robot, times_ns in zip(plan.robots, trace.times_ns, strict=True)
-        if not len(times_ns) or times_ns[-1] < needed
-    ]
-    if early:
-        who = "every robot ended early, the first" if len(early) == len(plan.robots) else "ended early:"
-        shown = early[:1] if len(early) == len(plan.robots) else early
-        reasons.append(f"{who} {', '.join(shown)} of {wanted / 1e9:g} s")
-    elif end_ns is None or end_ns < needed:
-        reasons.append(f"the robots have no instant in common at the end of {wanted / 1e9:g} s")
-    return reasons
-
-
-def _failed(claims: Sequence[ClaimResult]) -> list[str]:
-    return [
-        f"claim: {claim.block} within {claim.band:.3g} of its largest error by {claim.settled_by:g} s, but "
-        + ("it did not settle" if claim.measured is None else f"that took {claim.measured:.6g} s")
-        for claim in claims
-        if not claim.holds
-    ]
-
-
-def _too_close(plan: Plan, near: Distances) -> list[str]:
-    if not plan.avoidance.enabled or not near.violations:
-        return []
-    worst = min(near.violations, key=lambda violation: violation.smallest)
-    one, other = (plan.robots[robot].name for robot in worst.pair)
-    return [
-        f"avoidance: {len(near.violations)} violation(s) of {plan.avoidance.avoidance_radius:g} m; {one} and {other} "
-        f"came to {worst.smallest:.4g} m after {worst.first_ns / 1e9:.6g} s"
-    ]

@@ -1,0 +1,79 @@
+"""How fast an error decays or grows: a line fitted to the logarithm of its amplitude.
+
+|e| of an oscillating block falls to zero twice in a period.  Its *amplitude* does not.  For the block alone,
+
+    ë = -K_1 e - K_2 ė,   K_1 = k1/σ²,  K_2 = k2/σ,   α = K_2/2,  ω² = K_1 - α² > 0,
+
+    a² = |e|² + |ė + α e|²/ω²
+
+falls as e^(-2αt), without a ripple.  Where the block does not oscillate (ω² ≤ 0) the amplitude is |e|.  Matrix gains count with
+their mean on the diagonal.  With delays, lead and coupling the block's true α and ω differ, and a little of the ripple is back.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echelon.sim.results.blocks import BlockSeries
+from echelon.sim.results.settling import ROUNDING
+from echelon.sim.results.trace import Array
+
+LEFT: Final = 0.02
+"""A decay is fitted down to this share of its largest amplitude"""
+LEAST: Final = 8
+"""Instants that a fit needs"""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """amplitude ~ e^(-rate t): the rate [1/s], negative where it grows, and r² of the fit to its logarithm."""
+
+    rate: float
+    r_squared: float
+
+
+def amplitude(series: BlockSeries) -> Array:
+    """Returns a block's amplitude [m], (T,)."""
+    block = series.block
+    if not block.size:
+        return series.norm
+    K_1 = float(np.trace(block.k1)) / block.size / block.sigma**2
+    alpha = float(np.trace(block.k2)) / block.size / block.sigma / 2
+    omega_squared = K_1 - alpha**2
+    if omega_squared <= 0:
+        return series.norm
+    with np.errstate(all="ignore"):
+        rest = np.square(series.error_rate + alpha * series.error).sum(axis=1) / omega_squared
+        return np.asarray(np.sqrt(np.square(series.norm) + rest))
+
+
+def decay(times_ns: NDArray[np.int64], amplitudes: Array, level: float) -> Fit | None:
+    """Returns the fit from the largest amplitude down to `LEFT` of it, or to twice the `level` at which it stays in the end
+    [m].
+
+    Where the amplitude is largest in the last half of the run, the fit is over that half.  None if there is too little of
+    it."""
+    if len(amplitudes) < LEAST or not np.isfinite(amplitudes).all():
+        return None
+    begin = int(np.argmax(amplitudes))
+    largest = float(amplitudes[begin])
+    if 2 * begin >= len(amplitudes):
+        return _line(times_ns[len(times_ns) // 2 :], amplitudes[len(times_ns) // 2 :])
+    low = max(LEFT * largest, min(2 * level, largest / np.e), ROUNDING)
+    below = np.flatnonzero(amplitudes[begin:] < low)
+    end = begin + int(below[0]) if below.size else len(amplitudes)
+    return _line(times_ns[begin:end], amplitudes[begin:end])
+
+
+def _line(times_ns: NDArray[np.int64], amplitudes: Array) -> Fit | None:
+    if len(amplitudes) < LEAST or amplitudes.min() <= 0:
+        return None
+    t = (times_ns - times_ns[0]) / 1e9
+    y = np.log(amplitudes)
+    t, y = t - t.mean(), y - y.mean()
+    slope = float(t @ y / (t @ t))
+    spread = float(y @ y)
+    missed = float(np.square(y - slope * t).sum())
+    return Fit(-slope, 1.0 - missed / spread if spread > 0 else 1.0)

@@ -222,12 +222,13 @@ class CanReport:
     """What would make them fit"""
     buses: tuple[BusReport, ...]
     scheduled: tuple[ScheduledEvent, ...]
-    sent: int
-    failed: int
+    sent: int | None
+    """None, here and below, where nobody knows: the run was killed and recovered"""
+    failed: int | None
     """Frames that a bus refused"""
-    dropped: int
+    dropped: int | None
     """Frames given up because a bus's queue stayed full"""
-    log_lost: int
+    log_lost: int | None
     """Lines that can.log lacks"""
     log_error: str | None
     robots: Mapping[str, WheelsReport]

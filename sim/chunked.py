@@ -5,6 +5,7 @@ So the chunk in progress is written provisionally, at short intervals of wall ti
 overwritten by its later self.  (A kill within that one write can cost the chunk: some microseconds ten times a second.)
 """
 
+import fcntl
 import os
 import struct
 import zlib
@@ -63,6 +64,8 @@ class ChunkedFile:
         self.failure: str | None = None
         self._path = path
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        with suppress(OSError):  # tells others that it is being written, until this process ends, however it ends
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._position = 0
         self._tail = b""
         self._buffer = bytearray()

@@ -1,76 +1,53 @@
-"""CSV files of a run: numbers in full (a float reads back as the same float), one header line, times in seconds."""
+"""The tables of a run (results.tables) as files: CSV, or Parquet where pyarrow is installed."""
 
-from collections.abc import Iterable, Sequence
-from itertools import repeat
+import csv
 from pathlib import Path
-from typing import Final
 
-import numpy as np
-
-from echelon.messages import STATE_FIELDS, field_index
-from echelon.sim.results.blocks import block_series, component_names
+from echelon.errors import UsageError
 from echelon.sim.results.run import Run
-from echelon.sim.results.trace import Trace
-
-ROBOT_FIELDS: Final = ("x", "y", "theta", "v", "omega", "ax", "ay", "tau_right", "tau_left")
-LINK_FIELDS: Final = (
-    "source", "receiver", "channel", "sent", "delivered", "lost", "in_flight", "used", "held", "age_mean", "age_max",
-)  # fmt: skip
+from echelon.sim.results.tables import Table
 
 
 def export_csv(run: Run, folder: Path) -> list[Path]:
-    """Writes `robots.csv`, `blocks.csv` and `links.csv` into a folder, which is made if need be; returns them.
+    """Writes each table of a run as CSV into a folder, which is made if need be; returns the files.
 
-    Robots: every state of every robot, by time, then robot.  Blocks: at the instants at which every robot has a state,
-    by time, block and component.  Links: one row each, ages in seconds.  Raises OSError.
-    """
+    Numbers stand in full: a float reads back as the same float.  One header line, times in seconds.  Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / name for name in ("robots.csv", "blocks.csv", "links.csv")]
-    _write(files[0], ("t", "robot", *ROBOT_FIELDS), _robots(run.trace))
-    _write(files[1], ("t", "block", "component", "value", "desired", "error", "rate"), _blocks(run.trace))
-    _write(files[2], LINK_FIELDS, (",".join(str(getattr(row, field)) for field in LINK_FIELDS) for row in run.links))
+    files = []
+    for name, table in run.tables.items():
+        files.append(folder / f"{name}.csv")
+        with files[-1].open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(table.columns)
+            writer.writerows(zip(*(column.tolist() for column in table.columns.values()), strict=True))
     return files
 
 
-def _robots(trace: Trace) -> Iterable[str]:
-    fields = field_index(STATE_FIELDS, *ROBOT_FIELDS)
-    times = np.concatenate(trace.times_ns)
-    robots = np.repeat(np.arange(len(trace.times_ns)), [len(times_ns) for times_ns in trace.times_ns])
-    order = np.lexsort((robots, times))
-    names = [robot.name for robot in trace.plan.robots]
-    columns = np.concatenate(trace.states)[:, fields][order].T
-    return map(
-        ",".join,
-        zip(
-            map(repr, (times[order] / 1e9).tolist()),
-            (names[robot] for robot in robots[order].tolist()),
-            *(map(repr, column.tolist()) for column in columns),
-            strict=True,
-        ),
-    )
+def export_parquet(run: Run, folder: Path) -> list[Path]:
+    """Writes each table of a run as Parquet into a folder, which is made if need be; returns the files.
+
+    The unit of a column is in its metadata.  Raises UsageError without pyarrow, which this package does not install by itself,
+    and OSError."""
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise UsageError("--parquet needs pyarrow, which is not installed: pip install pyarrow") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, table in run.tables.items():
+        files.append(folder / f"{name}.parquet")
+        parquet.write_table(_arrow(table), files[-1])
+    return files
 
 
-def _blocks(trace: Trace) -> Iterable[str]:
-    blocks = block_series(trace)
-    names = [
-        f"{series.block.name},{component}" for series in blocks.series for component in component_names(series.block)
-    ]
-    parts = ("value", "desired", "error", "rate")
-    columns = [
-        np.concatenate([getattr(series, part) for series in blocks.series], axis=1).reshape(-1) for part in parts
-    ]
-    return map(
-        ",".join,
-        zip(
-            (time for time in map(repr, blocks.seconds.tolist()) for _ in names),
-            (name for same in repeat(names, len(blocks.times_ns)) for name in same),
-            *(map(repr, column.tolist()) for column in columns),
-            strict=True,
-        ),
-    )
+def _arrow(table: Table) -> object:
+    import pyarrow
 
-
-def _write(path: Path, header: Sequence[str], rows: Iterable[str]) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join(header) + "\n")
-        file.writelines(f"{row}\n" for row in rows)
+    units, columns, described = table.units, [], []
+    for name, values in table.columns.items():
+        text = values.dtype == object
+        columns.append(pyarrow.array(values, pyarrow.string() if text else None))
+        described.append(
+            pyarrow.field(name, columns[-1].type, metadata={"unit": units[name]} if name in units else None)
+        )
+    return pyarrow.table(columns, schema=pyarrow.schema(described))

@@ -137,7 +137,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
 
     if plan.bridge is not None:
         for robot in plan.robots:
-            add(Channel.TORQUE, robot.index, f"/{ros.ros_name(robot.path)}/torque", "WheelTorque", ros.wheel_torque())
+            add(Channel.TORQUE, robot.index, torque_topic(robot.path), "WheelTorque", ros.wheel_torque())
         add(Channel.WHEELS, plan.bridge.index, "/wheels", "Wheels", ros.wheels(2 * len(plan.robots)))
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
@@ -166,3 +166,8 @@ def frame_topics(plan: Plan) -> list[str]:
 def state_topic(path: str) -> str:
     """Returns the topic of a robot's state."""
     return f"/{ros.ros_name(path)}/state"
+
+
+def torque_topic(path: str) -> str:
+    """Returns the topic of the torques that a robot wants, on a closed torque path."""
+    return f"/{ros.ros_name(path)}/torque"

@@ -6,11 +6,11 @@ Whatever is wrong with a file's content is a ValueError with one line that begin
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from os import replace
+from os import SEEK_END, replace
 from pathlib import Path
 from typing import Final
 
@@ -20,14 +20,15 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from echelon.link import LinkCounts
-from echelon.messages import STATE_FIELDS
+from echelon.messages import STATE_FIELDS, TORQUE_FIELDS
 from echelon.messages import Channel as MessageChannel
 from echelon.plan import Plan
 from echelon.sim import ros
 from echelon.sim.chunked import CHUNK_SIZE, MAGIC, METADATA
-from echelon.sim.recorder import LINKS, SCENARIO, state_topic
+from echelon.sim.recorder import LINKS, SCENARIO, state_topic, torque_topic
 from echelon.sim.results.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
@@ -41,7 +42,6 @@ _READERS: Final = {
     Opcode.METADATA: Metadata.read,
     Opcode.SCHEMA: Schema.read,
 }
-_STATE_SIZE: Final = 8 * len(STATE_FIELDS)
 
 
 class CutError(ValueError):
@@ -63,22 +63,41 @@ def read_trace(path: Path, plan: Plan) -> Trace:
     """Returns the robots' states, bit for bit as they were recorded.
 
     Raises ValueError if the file is cut, damaged, no recording, or none of this plan."""
-    robots = {state_topic(robot.path): robot.index for robot in plan.robots}
-    prefix = len(ros.robot_state().encode(ros.stamp(0), b""))
-    times: list[list[int]] = [[] for _ in plan.robots]
-    states: list[list[bytes]] = [[] for _ in plan.robots]
+    topics = [state_topic(robot.path) for robot in plan.robots]
     with _blame(path):
-        for topic, time_ns, data in _messages(path, robots, "echelon_msgs/RobotState"):
-            if len(data) != prefix + _STATE_SIZE:
-                raise ValueError(f"a state of {topic} has {len(data)} bytes, not {prefix + _STATE_SIZE}")
-            robot = robots[topic]
-            times[robot].append(time_ns)
-            states[robot].append(data[prefix:])
-        return Trace(
-            plan,
-            tuple(np.array(row, np.int64) for row in times),
-            tuple(np.frombuffer(b"".join(row), "<f8").reshape(-1, len(STATE_FIELDS)) for row in states),
-        )
+        times_ns, states = _by_robot(path, topics, "RobotState", ros.robot_state(), len(STATE_FIELDS))
+        return Trace(plan, times_ns, states)
+
+
+def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Returns what the robots of a closed torque path wanted of their wheels: of each robot its instants [ns], (T,), and what
+    it said, (T, len(TORQUE_FIELDS)).
+
+    Raises ValueError if the file is cut, damaged, no recording, or none of this plan."""
+    topics = [torque_topic(robot.path) for robot in plan.robots]
+    with _blame(path):
+        times_ns, torques = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), len(TORQUE_FIELDS))
+        return list(zip(times_ns, torques, strict=True))
+
+
+def _by_robot(
+    path: Path, topics: Sequence[str], kind: str, splice: ros.Splice, width: int
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.float64], ...]]:
+    """Returns the times [ns] and the values, `width` numbers each, of the messages of topics, one topic for each robot."""
+    robots = {topic: robot for robot, topic in enumerate(topics)}
+    prefix = len(splice.encode(ros.stamp(0), b""))
+    times: list[list[int]] = [[] for _ in topics]
+    values: list[list[bytes]] = [[] for _ in topics]
+    for topic, time_ns, data in _messages(path, robots, f"echelon_msgs/{kind}"):
+        if len(data) != prefix + 8 * width:
+            raise ValueError(f"a {kind} of {topic} has {len(data)} bytes, not {prefix + 8 * width}")
+        robot = robots[topic]
+        times[robot].append(time_ns)
+        values[robot].append(data[prefix:])
+    return (
+        tuple(np.array(row, np.int64) for row in times),
+        tuple(np.frombuffer(b"".join(row), "<f8").reshape(-1, width) for row in values),
+    )
 
 
 def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
@@ -111,6 +130,13 @@ def read_metadata(path: Path) -> dict[str, str]:
             if isinstance(record, Metadata) and record.name == METADATA:
                 return record.metadata
         raise ValueError("holds no metadata of a run")
+
+
+def is_finished(path: Path) -> bool:
+    """Returns True if a file ends as a finished one does: behind its messages there is a summary for those who seek in it."""
+    with path.open("rb") as file:
+        file.seek(-min(len(MAGIC), path.stat().st_size), SEEK_END)
+        return file.read() == MAGIC
 
 
 def recover(source: Path, target: Path) -> RecoverResult:

@@ -43,7 +43,9 @@ from echelon.sim.watchers import RunRecorder
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
-FILES: Final = ("scenario.toml", "run.mcap", "can.log", "torque*.dbc", "summary.json", "report.html")
+CUT: Final = "run.mcap.cut"
+"""The recording of a run that was killed, once it has been mended (echelon.sim.recovery)."""
+FILES: Final = ("scenario.toml", "run.mcap", CUT, "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
 
 

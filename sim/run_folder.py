@@ -4,16 +4,15 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-import cantools
-
-from echelon.bridge.canlog import Logged, read_log
-from echelon.bridge.plan_dbc import plan_dbc
+from echelon.bridge.frame import Frame
+from echelon.bridge.referee import read_run_log
 from echelon.errors import UserError
 from echelon.plan import Plan
 from echelon.shipped import EFFECTIVE
 from echelon.sim.parts import load
-from echelon.sim.recording import read_trace
+from echelon.sim.recording import CutError, read_trace
 from echelon.sim.report import RunForReport, write_report
+from echelon.sim.results.frames import FrameDecoder, frame_data
 from echelon.sim.results.rendering import read_summary
 from echelon.sim.results.run import Run
 
@@ -26,12 +25,17 @@ def open_run(folder: Path) -> Run:
     try:
         _, plan = load(folder / EFFECTIVE, trial=False)
         summary = read_summary(folder / "summary.json")
+    except FileNotFoundError as error:
+        hint = f"`echelon recover {folder}` rebuilds what a killed run left"
+        raise UserError(f"{error.filename}: {error.strerror}; {hint}") from None
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
     except ValueError as error:
         raise UserError(f"{folder / 'summary.json'}: {error}") from None
     try:
         trace = read_trace(folder / "run.mcap", plan)
+    except CutError:
+        raise UserError(f"{folder / 'run.mcap'}: is cut short; `echelon recover {folder}` mends it") from None
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
     except ValueError as error:  # which begins with the file
@@ -54,36 +58,25 @@ def report_on(folders: list[Path], path: Path) -> None:
 
 def first_frames(path: Path, plan: Plan, count: int = FRAMES) -> tuple[dict[str, object], ...]:
     """Returns the first frames of a run in its can.log, decoded by its DBC; none if there is no log."""
-    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
-    databases = {
-        bus.name: cantools.database.load_string(plan_dbc(plan, number), "dbc")
-        for number, bus in enumerate(plan.can.buses)
-    }
+    running = (logged for logged in read_run_log(path, plan) if logged[0] >= 0)
     try:
-        running = (logged for logged in read_log(path) if logged.time_ns >= start_ns)
-        return tuple(_row(logged, databases.get(logged.channel), start_ns) for logged in islice(running, count))
+        first = list(islice(running, count))
     except OSError:
         return ()
+    decoder, names = FrameDecoder(plan), [bus.name for bus in plan.can.buses]
+    return tuple(_row(decoder, names[bus], time_ns, bus, frame) for time_ns, bus, frame in first)
 
 
-def _row(logged: Logged, database: Any, start_ns: int) -> dict[str, object]:
-    time_ns, channel, (can_id, data, remote) = logged
-    name, text = "", ""
-    try:
-        message = database.get_message_by_frame_id(can_id)
-        name = message.name
-        signals = message.decode(data, allow_truncated=True)
-        units = {signal.name: signal.unit or "" for signal in message.signals}
-        text = ", ".join(f"{signal} {_value(value)} {units[signal]}".rstrip() for signal, value in signals.items())
-    except Exception:  # a frame of nobody here, or one that says nothing
-        pass
-    content = "R" if remote else data.hex().upper()
+def _row(decoder: FrameDecoder, name: str, time_ns: int, bus: int, frame: Frame) -> dict[str, object]:
+    signals = decoder.signals(bus, frame)
+    units = decoder.units(bus, frame.can_id) if signals else {}
+    says = [f"{signal} {_value(value)} {units[signal]}".rstrip() for signal, value in signals.items()]
     return {
-        "t [s]": f"{(time_ns - start_ns) / 1e9:.6f}",
-        "bus": channel,
-        "frame": f"{can_id:03X}#{content}",
-        "message": name,
-        "says": text,
+        "t [s]": f"{time_ns / 1e9:.6f}",
+        "bus": name,
+        "frame": f"{frame.can_id:03X}#{frame_data(frame)}",
+        "message": decoder.name(bus, frame.can_id),
+        "says": ", ".join(says),
     }
 
 

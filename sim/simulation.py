@@ -13,7 +13,7 @@ from echelon.sim.engine import Engine, Row
 from echelon.sim.notebook import AnyScenario, load
 from echelon.sim.results.blocks import block_series
 from echelon.sim.results.records import RunFacts
-from echelon.sim.results.run import Run, Table
+from echelon.sim.results.run import Records, Run
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Array, TraceBuilder
 from echelon.turns import Turn
@@ -60,7 +60,7 @@ class Simulation:
         return self._time_ns / 1e9
 
     @property
-    def states(self) -> Table:
+    def states(self) -> Records:
         """What the robots last said, one record each: `robot` and the fields of `echelon.messages.STATE_FIELDS`."""
         table = np.zeros(len(self.plan.robots), dtype=_STATE)
         table["robot"] = [robot.name for robot in self.plan.robots]

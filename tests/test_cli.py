@@ -12,6 +12,7 @@ import cantools
 import pytest
 from runs import ROOT, echelon, plan_of, trace_of
 
+from echelon.messages import STATE_FIELDS
 from echelon.sim.recording import read_links, read_metadata, read_scenario, read_trace
 
 QUICK = ("--set", "duration=0.2", "--set", "claims=[]")
@@ -195,7 +196,7 @@ def test_what_is_wrong_with_a_runs_folder_names_the_file_once(folder: Path, tmp_
     for command in ("report", "export"):
         done = echelon(command, run)
         assert done.returncode == 2
-        assert done.stderr == f"echelon: {run}/run.mcap: is cut short; mend it with `echelon recover`\n"
+        assert done.stderr == f"echelon: {run}/run.mcap: is cut short; `echelon recover {run}` mends it\n"
     (run / "summary.json").write_text("{")
     done = echelon("report", run)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
@@ -220,11 +221,11 @@ def test_export_writes_tables(folder: Path, tmp_path: Path) -> None:
     trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=0.2"))
     with (tmp_path / "robots.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["t", "robot", "x", "y", "theta", "v", "omega", "ax", "ay", "tau_right", "tau_left"]
+    assert list(rows[0]) == ["t", "robot", *STATE_FIELDS, "x_desired", "y_desired"]
     assert len(rows) == 9 * 201
     last = next(row for row in reversed(rows) if row["robot"] == "g1/r2")
     assert float(last["x"]) == trace.states[0][-1][0]
-    assert (tmp_path / "blocks.csv").read_text().startswith("t,block,component,value,desired,error,rate\n")
+    assert (tmp_path / "blocks.csv").read_text().startswith("t,block,component,value,desired,error,rate,error_rate\n")
     assert (tmp_path / "links.csv").exists()
 
 
@@ -232,11 +233,17 @@ def test_export_goes_into_the_runs_folder_and_says_so(folder: Path, tmp_path: Pa
     run = tmp_path / "run"
     shutil.copytree(folder, run)
     done = echelon("export", run)
-    assert (done.returncode, done.stdout) == (0, f"{run}/csv: robots.csv, blocks.csv, links.csv\n"), done.stderr
-    assert {path.name for path in (run / "csv").iterdir()} == {"robots.csv", "blocks.csv", "links.csv"}
-    facts = json.loads(echelon("export", run, "--csv", tmp_path / "tables", "--json").stdout)
-    assert (facts["run"], facts["folder"]) == (str(run), str(tmp_path / "tables"))
-    assert all((tmp_path / "tables" / name).exists() for name in facts["files"])
+    assert (done.returncode, done.stdout) == (0, f"{run}/csv: robots.csv, blocks.csv, links.csv, frames.csv\n"), (
+        done.stderr
+    )
+    written = sorted(path.name for path in (run / "csv").iterdir())
+    assert written == ["blocks.csv", "frames.csv", "links.csv", "robots.csv"]
+    other, parquet = tmp_path / "tables", tmp_path / "parquet"
+    facts = json.loads(echelon("export", run, "--csv", other, "--parquet", parquet, "--json").stdout)
+    assert (facts["run"], sorted(facts["files"])) == (str(run), sorted(map(str, (other, parquet))))
+    for folder, files in facts["files"].items():
+        assert sorted(path.name for path in Path(folder).iterdir()) == sorted(files)
+        assert len(files) == 4
     refused = echelon("export", run, "--csv", run / "run.mcap")
     assert refused.stderr == f"echelon: --csv {run}/run.mcap: File exists\n"
 

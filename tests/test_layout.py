@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from numpy.random import default_rng
 from trees import plan_of, random_epsilon, scenario, trees, with_random_gains
 
-from echelon.controller.law import CentralLaw
+from echelon.controller.laws.central import CentralLaw
 from echelon.layout import CENTROID, POSITION, NodeLayout, acceleration_of, said_by
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, Channel, Message
 from echelon.plan import NodePlan, Plan

@@ -45,7 +45,7 @@ def test_from_disk_it_is_the_same(lab: echelon.Run) -> None:
 
 def test_tables_have_names_and_units(lab: echelon.Run) -> None:
     robot = lab.robots["g1/r1"]
-    assert robot.dtype.names == ("t", *STATE_FIELDS)
+    assert robot.dtype.names == ("t", *STATE_FIELDS, "x_desired", "y_desired")
     assert (robot["t"][0], robot["t"][-1]) == (0.0, 0.5)
     np.testing.assert_array_equal(robot["x"], lab.trace.states[0][:, 0])
     inter = lab.blocks["inter"]

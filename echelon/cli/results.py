@@ -1,13 +1,17 @@
 """Commands about what runs left: `report`, `export`, `recover`."""
 
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from echelon.cli.options import Command, argument, option
 from echelon.cli.shared import JSON
 from echelon.errors import UsageError
+
+if TYPE_CHECKING:
+    from echelon.sim.recording import RecoverResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,26 +45,35 @@ class ExportOptions:
     """Options of `echelon export`."""
 
     run: Path = field(metadata=argument("the folder of a run", "RUN"))
-    csv: Path | None = field(default=None, metadata=option("folder for the files (default: RUN/csv)", "DIR"))
+    csv: Path | None = field(default=None, metadata=option("folder for CSV files (default: RUN/csv)", "DIR"))
+    parquet: Path | None = field(
+        default=None,
+        metadata=option("folder for Parquet files; needs pyarrow; no CSV then, unless --csv is given", "DIR"),
+    )
     json: bool = field(default=False, metadata=JSON)
 
 
 def export(options: ExportOptions) -> int:
-    """Writes a run as CSV."""
-    from echelon.sim.export import export_csv
+    """Writes a run's tables as CSV or Parquet."""
+    from echelon.sim.export import export_csv, export_parquet
     from echelon.sim.run_folder import open_run
 
     run = open_run(options.run)
-    folder = options.csv or options.run / "csv"
-    try:
-        files = export_csv(run, folder)
-    except OSError as error:
-        what = folder if options.csv is None else f"--csv {folder}"
-        raise UsageError(f"{what}: {error.strerror}") from None
+    jobs = [("--parquet", export_parquet, options.parquet), ("--csv", export_csv, options.csv)]
+    if options.parquet is None and options.csv is None:
+        jobs = [("", export_csv, options.run / "csv")]
+    written: dict[str, list[str]] = {}
+    for flag, write, folder in jobs:
+        if folder is not None:
+            try:
+                written[str(folder)] = [path.name for path in write(run, folder)]
+            except OSError as error:
+                raise UsageError(f"{flag} {folder}: {error.strerror}".strip()) from None
     if options.json:
-        print(json.dumps({"run": str(options.run), "folder": str(folder), "files": [path.name for path in files]}))
+        print(json.dumps({"run": str(options.run), "files": written}))
     else:
-        print(f"{folder}: {', '.join(path.name for path in files)}")
+        for where, names in written.items():
+            print(f"{where}: {', '.join(names)}")
     return 0
 
 
@@ -68,31 +81,61 @@ def export(options: ExportOptions) -> int:
 class RecoverOptions:
     """Options of `echelon recover`."""
 
-    file: Path = field(metadata=argument("an MCAP file that was cut off or is damaged", "FILE"))
+    what: Path = field(metadata=argument("the folder of a run, or an MCAP file that was cut off or is damaged", "RUN"))
     out: Path | None = field(
-        default=None, metadata=option("where to write what is whole (default: <file>-recovered.mcap)", "FILE")
+        default=None,
+        metadata=option("where to write what is whole of a file (default: <file>-recovered.mcap)", "FILE"),
     )
     json: bool = field(default=False, metadata=JSON)
 
 
 def recover(options: RecoverOptions) -> int:
-    """Mends a recording that was cut off."""
-    from echelon.sim.recording import recover as mend
-
-    target = options.out or options.file.with_name(options.file.stem + "-recovered.mcap")
+    """Rebuilds the folder of a run that was killed, or mends a recording that was cut off."""
     try:
-        result = mend(options.file, target)
+        return _recover_folder(options) if options.what.is_dir() else _recover_file(options)
     except OSError as error:
-        raise UsageError(f"{error.filename or options.file}: {error.strerror}") from None
+        raise UsageError(f"{error.filename or options.what}: {error.strerror}") from None
     except ValueError as error:  # which begins with the file
         raise UsageError(str(error)) from None
-    until_s = (result.until_ns or 0) / 1e9
+
+
+def _recover_folder(options: RecoverOptions) -> int:
+    from echelon.sim.recovery import recover_run
+
+    if options.out is not None:
+        raise UsageError(f"--out {options.out}: the folder of a run is mended in place; --out is for a file")
+    done = recover_run(options.what)
     if options.json:
-        facts = {"messages": result.messages, "until": until_s, "damaged": result.damaged, "complete": result.complete}
-        print(json.dumps({"file": str(target), **facts}))
+        print(json.dumps({"run": str(options.what), **_facts(done.recording), "files": done.files}))
+    elif done.files:
+        print(f"{options.what}: {_text(done.recording)}; written anew: {', '.join(done.files)}")
     else:
-        print(f"{target}: {result.messages} messages, up to t = {until_s:g} s")
+        print(f"{options.what}: is whole, nothing was changed")
+    if done.report_failure:
+        print(f"echelon: {done.report_failure}", file=sys.stderr)
     return 0
+
+
+def _recover_file(options: RecoverOptions) -> int:
+    from echelon.sim.recording import recover as mend
+
+    target = options.out or options.what.with_name(options.what.stem + "-recovered.mcap")
+    result = mend(options.what, target)
+    if options.json:
+        print(json.dumps({"file": str(target), **_facts(result)}))
+    else:
+        print(f"{target}: {_text(result)}")
+    return 0
+
+
+def _facts(result: "RecoverResult") -> dict[str, Any]:
+    """Returns what was saved of a recording, as JSON has it."""
+    until_s = (result.until_ns or 0) / 1e9
+    return {"messages": result.messages, "until": until_s, "damaged": result.damaged, "complete": result.complete}
+
+
+def _text(result: "RecoverResult") -> str:
+    return f"{result.messages} messages, up to t = {(result.until_ns or 0) / 1e9:g} s"
 
 
 COMMANDS: Final[tuple[Command[Any], ...]] = (
@@ -114,11 +157,13 @@ It needs no other file and no network.""",
         options=ExportOptions,
         work=export,
         about="""\
-Writes what a run recorded as CSV: every state of every robot, the shape variables and the
-centroid with their errors, and what became of the messages of each link.""",
+Writes what a run recorded as tables, CSV or Parquet: every state of every robot, and where the
+desired formation has it; the shape variables and the centroid with their errors; what became of
+the messages of each link; CAN frames, decoded; of a closed torque path what each wheel was
+asked for and did.  A notebook has the same tables: `run.tables`, `run.to_pandas()`.""",
         examples={
-            "echelon export runs/demo": "into runs/demo/csv",
-            "echelon export runs/demo --csv tables": "into a folder of yours",
+            "echelon export runs/demo": "robots.csv and the others in runs/demo/csv",
+            "echelon export runs/demo --csv tables": "in a folder of yours",
         },
         codes={0: "written"},
     ),
@@ -127,8 +172,11 @@ centroid with their errors, and what became of the messages of each link.""",
         options=RecoverOptions,
         work=recover,
         about="""\
-Writes what is whole in a recording that was cut off, or is damaged, as a complete MCAP file.""",
+Rebuilds what a run that was killed left: mends its run.mcap, keeping the one that was cut as
+run.mcap.cut, and writes summary.json and report.html from it; then report and export work.
+Of an MCAP file alone, writes what is whole in it as a complete file.""",
         examples={
+            "echelon recover runs/demo": "run.mcap, summary.json and report.html in place",
             "echelon recover runs/demo/run.mcap": "runs/demo/run-recovered.mcap",
             "echelon recover runs/demo/run.mcap --out mended.mcap": "into a file of yours",
         },

@@ -337,7 +337,7 @@ def _recording(evidence: Evidence) -> Iterator[CheckResult]:
         for robot, times_ns in zip(plan.robots, evidence.trace.times_ns, strict=True)
         if len(times_ns)
     )
-    lost = can.log_lost if can is not None else 0
+    lost = (can.log_lost or 0) if can is not None else 0
     if missing or lost:
         parts = [f"{missing} states"] * bool(missing) + [f"{lost} lines of can.log"] * bool(lost)
         text = f"the recording lacks {' and '.join(parts)}"

@@ -264,13 +264,13 @@ class RunFacts:
     """`processes` or `inprocess`"""
     clock: str
     """`virtual` or `wall`"""
-    wall_time: float
-    """From run time 0 to the end [s]"""
-    startup_time: float
+    wall_time: float | None
+    """From run time 0 to the end [s]; None, here and below, where nobody knows: the run was killed and recovered"""
+    startup_time: float | None
     real_time_factor: float | None
     """Run time over wall time"""
     ticks_per_second: float | None
-    messages: int
+    messages: int | None
     failure: str | None
     """Why it broke off"""
     stopped: str | None = None

@@ -1,48 +1,72 @@
 """A finished run for people who compute: its summary, and its states and errors as numpy arrays with named fields."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from echelon.bridge.referee import read_run_log
 from echelon.messages import STATE_FIELDS
 from echelon.plan import Plan
-from echelon.sim.results.blocks import Blocks, BlockSeries, block_series, component_names
+from echelon.sim.results.blocks import Blocks, BlockSeries, block_series
 from echelon.sim.results.records import LinkResult, Summary
-from echelon.sim.results.trace import Trace
+from echelon.sim.results.tables import (
+    DESIRED,
+    PARTS,
+    UNITS,
+    Table,
+    blocks_table,
+    desired_places,
+    links_table,
+    robots_table,
+)
+from echelon.sim.results.trace import Array, Trace
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
     from echelon.sim.figures import Picture
 
-UNITS: Final[Mapping[str, str]] = {
-    "t": "s",
-    "x": "m", "y": "m", "vx": "m/s", "vy": "m/s",
-    "theta": "rad", "v": "m/s", "omega": "rad/s",
-    "ax": "m/s²", "ay": "m/s²",
-    "tau_right": "N m", "tau_left": "N m",
-    "tau_right_square": "N² m²", "tau_left_square": "N² m²",
-    "tau_right_peak": "N m", "tau_left_peak": "N m",
-    "saturated": "torque periods",
-    "value": "m", "desired": "m", "error": "m", "norm": "m",
-    "rate": "m/s", "error_rate": "m/s",
-}  # fmt: skip
-"""Units of all fields of `Run.robots` and `Run.blocks`"""
-Table = NDArray[np.void]
+Value = TypeVar("Value")
+Records = NDArray[np.void]
 
 
-@dataclass(frozen=True, slots=True)
-class Frames:
-    """A run as pandas data frames: robots by (t, robot), blocks by (t, block, component), links by their ends."""
+@dataclass(frozen=True)
+class DataFrames:
+    """The tables of a run as pandas data frames, each made when it is first asked for.
 
-    robots: "DataFrame"
-    blocks: "DataFrame"
-    links: "DataFrame"
+    Raises KeyError for one that this run does not have (`Run.tables`)."""
+
+    tables: Mapping[str, Table]
+
+    @cached_property
+    def robots(self) -> "DataFrame":
+        """All states, by (t, robot)."""
+        return self.tables["robots"].to_pandas()
+
+    @cached_property
+    def blocks(self) -> "DataFrame":
+        """Shape variables, centroid and their errors, by (t, block, component)."""
+        return self.tables["blocks"].to_pandas()
+
+    @cached_property
+    def links(self) -> "DataFrame":
+        """What became of messages, by (source, receiver, channel)."""
+        return self.tables["links"].to_pandas()
+
+    @cached_property
+    def torques(self) -> "DataFrame":
+        """Of a closed torque path: wanted, commanded and reported torques, by (t, robot, wheel)."""
+        return self.tables["torques"].to_pandas()
+
+    @cached_property
+    def frames(self) -> "DataFrame":
+        """CAN frames, decoded, by (t, bus, identifier)."""
+        return self.tables["frames"].to_pandas()
 
 
 class Run:
@@ -52,7 +76,8 @@ class Run:
         run.blocks["inter"]["norm"]      |e| of a block at the instants that all robots share [m]
         run.figure("errors")             a figure of the report
 
-    `robots` and `blocks` hold structured numpy arrays: one record per instant, fields as in `run.units`.
+    `robots` and `blocks` hold structured numpy arrays: one record per instant, fields as in `run.units`.  `tables` are what
+    `echelon export` writes.
     """
 
     units = UNITS
@@ -78,22 +103,62 @@ class Run:
         return self.summary.run.failure
 
     @cached_property
-    def robots(self) -> "Named":
-        """By robot, its states: `t` and the fields of a state message (echelon.messages.STATE_FIELDS)."""
-        names = {robot.name: robot.index for robot in self.plan.robots}
-        return Named("robot", names, lambda number: _states(self.trace, number))
+    def robots(self) -> "Named[Records]":
+        """By robot, its states: `t`, the fields of a state message (echelon.messages.STATE_FIELDS), and `x_desired` and
+        `y_desired`, where the desired formation has it."""
+        return Named("robot", {robot.name: partial(self._states, robot.index) for robot in self.plan.robots})
 
     @cached_property
-    def blocks(self) -> "Named":
+    def blocks(self) -> "Named[Records]":
         """By block, its variables: `t`, `value`, `desired`, `error`, `rate`, `error_rate` (a number for each component)
         and `norm`, which is |error|."""
         series = self._blocks.series
-        names = {one.block.name: number for number, one in enumerate(series)}
-        return Named("block", names, lambda number: _variables(self._blocks, series[number]))
+        return Named("block", {one.block.name: partial(_variables, self._blocks, one) for one in series})
+
+    @cached_property
+    def tables(self) -> "Named[Table]":
+        """By name, the tables of `echelon export`: `robots`, `blocks`, `links`; of a run with a folder also `frames`, if there
+        were any, and `torques`, if the torque path was closed."""
+        makers: dict[str, Callable[[], Table]] = {
+            "robots": lambda: robots_table(self.trace),
+            "blocks": lambda: blocks_table(self._blocks),
+            "links": lambda: links_table(self.links),
+        }
+        if self.folder is not None and (log := self.folder / "can.log").exists():
+            if self.plan.can.closed:
+                makers["torques"] = lambda: self._torques(log)
+            makers["frames"] = lambda: self._frames(log)
+        return Named("table", makers)
 
     @cached_property
     def _blocks(self) -> Blocks:
         return block_series(self.trace)
+
+    @cached_property
+    def _places(self) -> list[Array]:
+        return desired_places(self.trace)
+
+    def _states(self, robot: int) -> Records:
+        times_ns, states, places = self.trace.times_ns[robot], self.trace.states[robot], self._places[robot]
+        table = np.empty(len(times_ns), dtype=[(name, "f8") for name in ("t", *STATE_FIELDS, *DESIRED)])
+        table["t"] = times_ns / 1e9
+        for fields, values in ((STATE_FIELDS, states), (DESIRED, places)):
+            for number, name in enumerate(fields):
+                table[name] = values[:, number]
+        table.flags.writeable = False
+        return table
+
+    def _torques(self, log: Path) -> Table:
+        from echelon.sim.recording import read_torques
+        from echelon.sim.results.torques import torques_table
+
+        said = read_torques(log.with_name("run.mcap"), self.plan)
+        return torques_table(self.plan, said, read_run_log(log, self.plan))
+
+    def _frames(self, log: Path) -> Table:
+        from echelon.sim.results.frames import frames_table
+
+        return frames_table(self.plan, read_run_log(log, self.plan))
 
     @property
     def links(self) -> tuple[LinkResult, ...]:
@@ -107,25 +172,11 @@ class Run:
 
         return picture(name, self.trace, self._blocks)
 
-    def to_pandas(self) -> Frames:
-        """Returns the run as data frames.  Raises ImportError without pandas, which this package does not install."""
-        from pandas import DataFrame, concat
+    def to_pandas(self) -> DataFrames:
+        """Returns the run's tables as data frames.  Raises ImportError without pandas, which this package does not install."""
+        import pandas  # noqa: F401  so that it is missed here
 
-        robots = concat(
-            [DataFrame(table).assign(robot=name) for name, table in self.robots.items()], ignore_index=True
-        ).set_index(["t", "robot"])
-        blocks = []
-        for series in self._blocks.series:
-            for number, component in enumerate(component_names(series.block)):
-                columns = {part: getattr(series, part)[:, number] for part in _PARTS}
-                names = {"block": series.block.name, "component": component}
-                blocks.append(DataFrame({"t": self._blocks.seconds, **columns}).assign(**names))
-        links = DataFrame([{field: getattr(link, field) for field in LinkResult.__slots__} for link in self.links])
-        return Frames(
-            robots=robots.sort_index(level="t", sort_remaining=False, kind="stable"),
-            blocks=concat(blocks, ignore_index=True).set_index(["t", "block", "component"]),
-            links=links.set_index(["source", "receiver", "channel"]) if len(links) else links,
-        )
+        return DataFrames(self.tables)
 
     def __getattr__(self, name: str) -> Any:
         if name in Summary.__slots__:
@@ -141,47 +192,35 @@ class Run:
         return f"<Run of {self.summary.scenario}: {self.summary.verdict.word}, {simulated}{where}>"
 
 
-_PARTS: Final = ("value", "desired", "error", "rate", "error_rate")
+class Named(Mapping[str, Value], Generic[Value]):
+    """Things by name; each is made when it is first asked for."""
 
+    def __init__(self, kind: str, makers: Mapping[str, Callable[[], Value]]) -> None:
+        self._kind, self._makers = kind, makers
+        self._made: dict[str, Value] = {}
 
-class Named(Mapping[str, Table]):
-    """Tables by name; each is made when it is first asked for."""
-
-    def __init__(self, kind: str, numbers: Mapping[str, int], make: Any) -> None:
-        self._kind, self._numbers, self._make = kind, numbers, make
-        self._made: dict[str, Table] = {}
-
-    def __getitem__(self, name: str) -> Table:
-        if name not in self._numbers:
-            raise KeyError(f"no {self._kind} {name!r}; there are {', '.join(self._numbers)}")
+    def __getitem__(self, name: str) -> Value:
+        if name not in self._makers:
+            raise KeyError(f"no {self._kind} {name!r}; there are {', '.join(self._makers)}")
         if name not in self._made:
-            self._made[name] = self._make(self._numbers[name])
+            self._made[name] = self._makers[name]()
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._numbers)
+        return iter(self._makers)
 
     def __len__(self) -> int:
-        return len(self._numbers)
+        return len(self._makers)
 
     def __repr__(self) -> str:
-        return f"<tables of {', '.join(self._numbers)}>"
+        return f"<{self._kind}s {', '.join(self._makers)}>"
 
 
-def _states(trace: Trace, robot: int) -> Table:
-    table = np.empty(len(trace.times_ns[robot]), dtype=[("t", "f8"), *((name, "f8") for name in STATE_FIELDS)])
-    table["t"] = trace.times_ns[robot] / 1e9
-    for number, name in enumerate(STATE_FIELDS):
-        table[name] = trace.states[robot][:, number]
-    table.flags.writeable = False
-    return table
-
-
-def _variables(blocks: Blocks, series: BlockSeries) -> Table:
-    parts = [(part, "f8", (series.block.size,)) for part in _PARTS]
+def _variables(blocks: Blocks, series: BlockSeries) -> Records:
+    parts = [(part, "f8", (series.block.size,)) for part in PARTS]
     table = np.empty(len(blocks.times_ns), dtype=[("t", "f8"), *parts, ("norm", "f8")])
     table["t"], table["norm"] = blocks.seconds, series.norm
-    for part in _PARTS:
+    for part in PARTS:
         table[part] = getattr(series, part)
     table.flags.writeable = False
     return table

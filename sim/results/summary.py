@@ -92,14 +92,16 @@ def _lines(summary: Summary) -> Iterator[str]:
         peak, robot = max(torques)
         share = max(row.saturation_share or 0.0 for row in summary.torque)
         yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
-    sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
-    age = max((link.age_max for link in summary.links if link.age_max is not None), default=None)
-    yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
+    if summary.links:
+        sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
+        age = max((link.age_max for link in summary.links if link.age_max is not None), default=None)
+        yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
     yield from can_lines(summary.can)
     run = summary.run
     if run.clock == "wall" and run.stages:
         yield f"  late     {run.late_stages} of {run.stages} stages, at most {number(run.latest, 's')}"
-    yield f"  wall     {number(run.wall_time, 's')}, {number(run.real_time_factor)} times real time"
+    if run.wall_time is not None:
+        yield f"  wall     {number(run.wall_time, 's')}, {number(run.real_time_factor)} times real time"
     yield f"  digest   {summary.trace_digest}"
 
 

@@ -22,9 +22,9 @@ from math import ceil, cos, hypot, isfinite, nan, sin, sqrt
 from typing import Final, NamedTuple
 
 from echelon.errors import PartRunError
-from echelon.plan import RobotPlan
+from echelon.plan.plan import RobotPlan
 from echelon.plugins import Plugin
-from echelon.values import NonNegative, Point
+from echelon.scenario.values import NonNegative, Point
 
 GRAVITY: Final = 9.81
 """[m/s²]"""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from math import cos, sin
 
 from echelon.agents.plant import RobotState
-from echelon.plan import RobotPlan
+from echelon.plan.plan import RobotPlan
 
 Inverse = Callable[[RobotState, float, float, float], tuple[float, float]]
 """(state, a_x, a_y [m/s²], lead [s]) → (τ_right, τ_left) [N m]."""

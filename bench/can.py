@@ -20,18 +20,18 @@ import can
 import numpy as np
 
 from bench.product import Row, table
-from echelon.bridge.bus import Bus, open_bus
-from echelon.bridge.bus_url import resolve_url
-from echelon.bridge.commander import RobotChannel
-from echelon.bridge.frame import Frame
-from echelon.bridge.protocols import drive_places, make_drive
-from echelon.loading import effective_toml
+from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus_url import resolve_url
+from echelon.bridge.roles.commander import RobotChannel
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.registry import drive_places, make_drive
+from echelon.planning.loading import effective_toml
 from echelon.messages import TORQUE_FIELDS, Channel, Message
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 from echelon.shipped import shipped
-from echelon.sim.engine import Engine
-from echelon.sim.parts import load
-from echelon.sim.supervisor import Supervisor
+from echelon.sim.engines.in_process import Engine
+from echelon.sim.parts.loading import load
+from echelon.sim.processes.supervisor import Supervisor
 
 CYCLES: Final = 500
 """Of nine frames each."""

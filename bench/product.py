@@ -6,14 +6,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from echelon.bridge.bus_url import resolve_url
-from echelon.loading import effective_toml
+from echelon.bridge.can.bus_url import resolve_url
+from echelon.planning.loading import effective_toml
 from echelon.shipped import shipped
-from echelon.sim.engine import Engine
-from echelon.sim.live import Display
-from echelon.sim.parts import load
+from echelon.sim.engines.in_process import Engine
+from echelon.sim.view.live import Display
+from echelon.sim.parts.loading import load
 from echelon.sim.run import execute
-from echelon.sim.supervisor import Supervisor
+from echelon.sim.processes.supervisor import Supervisor
 
 
 @dataclass(frozen=True, slots=True)

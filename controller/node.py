@@ -5,7 +5,7 @@ centroid from its parent (the root: from the law of the centroid), adds its own 
 acceleration per child: a = Φ_node⁻¹ (ν_shape, a_centroid).  Because Φ_M is built of the nodes, so is its inverse: the
 robots' accelerations are those of the central law (`controller.laws.central.CentralLaw`).
 
-Two more things travel with these (`echelon.layout`): error rates of all blocks, where blocks are coupled, and forces of
+Two more things travel with these (`echelon.plan.layout`): error rates of all blocks, where blocks are coupled, and forces of
 avoidance.  A pair of robots belongs to the lowest node that has both below it: that node computes its ∇f from the positions
 its children sent up.  Above that node the pair's two forces cancel in every mean, below it they are handed down.
 
@@ -23,11 +23,11 @@ from echelon.controller.laws.in_tree import BlockGains, NodeBlocks
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import desired_shape, node_matrix
-from echelon.layout import CENTROID, NodeLayout
+from echelon.plan.layout import CENTROID, NodeLayout
 from echelon.messages import NULL, Channel, Heard, Message, Values
-from echelon.plan import Array, NodePlan, Plan
+from echelon.plan.plan import Array, NodePlan, Plan
 from echelon.role import Input, Stage
-from echelon.turns import Turn
+from echelon.runtime.turns import Turn
 
 
 @dataclass(frozen=True, slots=True)

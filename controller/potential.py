@@ -15,7 +15,7 @@ pushed apart with the cap `force_limit`, which also bounds ∇f outside, where a
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.plan import Array, AvoidancePlan
+from echelon.plan.plan import Array, AvoidancePlan
 
 
 def potential(distance: Array, plan: AvoidancePlan) -> Array:

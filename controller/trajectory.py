@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from echelon.errors import PartRunError
-from echelon.plan import Array
+from echelon.plan.plan import Array
 from echelon.plugins import Part, Plugin
-from echelon.values import Finite, NonNegative, Point, Positive
+from echelon.scenario.values import Finite, NonNegative, Point, Positive
 
 
 class Trajectory(Plugin, ABC):

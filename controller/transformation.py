@@ -15,7 +15,7 @@ from math import sqrt
 
 import numpy as np
 
-from echelon.plan import Array, NodePlan, Plan, ShapePlan
+from echelon.plan.plan import Array, NodePlan, Plan, ShapePlan
 
 
 def node_matrix(weights: Sequence[int]) -> Array:

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from echelon.agents.plant import Plant
-    from echelon.bridge.protocol import DriveProtocol
+    from echelon.bridge.protocols.protocol import DriveProtocol
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.notebook import Loaded, load, open_run, run
     from echelon.sim.results.run import Run
-    from echelon.sim.simulation import Simulation
+    from echelon.sim.engines.simulation import Simulation
 
 __version__ = "0.1.0"
 __all__ = [
@@ -57,7 +57,7 @@ def __getattr__(name: str) -> Any:
 
             found = {"Run": Run}
         case "Simulation":
-            from echelon.sim.simulation import Simulation
+            from echelon.sim.engines.simulation import Simulation
 
             found = {"Simulation": Simulation}
         case "Plant":
@@ -69,7 +69,7 @@ def __getattr__(name: str) -> Any:
 
             found = {"Trajectory": Trajectory}
         case "DriveProtocol":
-            from echelon.bridge.protocol import DriveProtocol
+            from echelon.bridge.protocols.protocol import DriveProtocol
 
             found = {"DriveProtocol": DriveProtocol}
         case "UserError":

@@ -25,14 +25,14 @@ class Channel(IntEnum):
     """Robot to leader: `STATE_FIELDS`."""
     GROUP_STATE = 2
     """Node to its parent: `GROUP_FIELDS`, then the error rates of every block below (where blocks are coupled), then
-    the positions of every robot below (where robots avoid each other); `echelon.layout` says where each stands."""
+    the positions of every robot below (where robots avoid each other); `echelon.plan.layout` says where each stands."""
     REFERENCE = 3
     """Node to its child nodes: an acceleration (x, y) per child, then the error rates of all blocks (where coupled),
     then the avoidance force (x, y) on every robot below (where robots avoid each other)."""
     COMMAND = 4
     """Group leader to its robots: an acceleration (x, y) per child."""
     FRAMES = 5
-    """Bridge and drives to each other and to those who watch: CAN frames with their times (bridge.frame_message)."""
+    """Bridge and drives to each other and to those who watch: CAN frames with their times (bridge.roles.frame_message)."""
     TORQUE = 6
     """Robot to bridge, on the closed torque path: `TORQUE_FIELDS`.  The drives take the speeds of their shafts from it."""
     WHEELS = 7

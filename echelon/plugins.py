@@ -23,7 +23,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from echelon.explain import PartError
+from echelon.planning.explain import PartError
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -133,7 +133,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Registry:
-    """All groups of parts.  Who assembles runs makes it (`echelon.sim.parts`), and planning uses it."""
+    """All groups of parts.  Who assembles runs makes it (`echelon.sim.parts.loading`), and planning uses it."""
 
     groups: Mapping[str, Group]
 

@@ -1,7 +1,7 @@
 """What a role is: a plain object with stages, each a function of (time, what it heard) that returns messages.
 
 Who calls the stages is none of the role's business: the in-process engine, a lockstep over Zenoh, or a wall clock.
-A stage runs at every multiple of its period; stages of one instant run in the order of their turns (`echelon.turns`).
+A stage runs at every multiple of its period; stages of one instant run in the order of their turns (`echelon.runtime.turns`).
 """
 
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from echelon.messages import Channel, Heard, Message
-from echelon.turns import Turn
+from echelon.runtime.turns import Turn
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,10 @@ Copy this file beside your scenario, say `robot.drive.protocol = "my_drive.py:My
 import struct
 from typing import Any
 
-from echelon.bridge.cyclic import Command, CyclicDrive, CyclicHost, CyclicObserver, Feedback, WheelState
-from echelon.bridge.frame import Frame
-from echelon.bridge.protocol import DriveProtocol
-from echelon.can_plan import DrivePlan, EnvelopePlan
+from echelon.bridge.protocols.cyclic import Command, CyclicDrive, CyclicHost, CyclicObserver, Feedback, WheelState
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.protocol import DriveProtocol
+from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 COMMAND, FEEDBACK = 0x300, 0x380  # each robot's number is added
 ENABLE, CLEAR, ESTOP = 1, 2, 4
@@ -103,7 +103,7 @@ class MyProtocol(DriveProtocol):
     def messages(self, drive: DrivePlan, name: str) -> list[Any]:  # the DBC, for cantools, SavvyCAN and the like
         from cantools.database.can import Message  # here, for it is slow to import and most processes need no DBC
 
-        from echelon.bridge.dbc import BRIDGE, number
+        from echelon.bridge.protocols.dbc import BRIDGE, number
 
         def signals(receiver: str, last: str) -> list[Any]:
             sides = (("tau_right", 0), ("tau_left", 16))

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from echelon.bridge.bus_url import interface_is_up, resolve_url
-from echelon.can_plan import DISTURBANCES
+from echelon.bridge.can.bus_url import interface_is_up, resolve_url
+from echelon.plan.can_plan import DISTURBANCES
 from echelon.errors import UsageError
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 
 
 def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:

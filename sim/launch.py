@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 from echelon.errors import UsageError, UserError
-from echelon.plan import Plan
-from echelon.scenario import Scenario
+from echelon.plan.plan import Plan
+from echelon.scenario.tables import Scenario
 from echelon.sim.bus_urls import bus_urls, check_wall_clock
-from echelon.sim.children import warm_up
-from echelon.sim.live import Display
+from echelon.sim.processes.children import warm_up
+from echelon.sim.view.live import Display
 from echelon.sim.results.run import Run
 from echelon.sim.run import execute, new_folder
 

@@ -4,14 +4,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from echelon.bridge.frame import Frame
-from echelon.bridge.referee import read_run_log
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.referee.referee import read_run_log
 from echelon.errors import UserError
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
-from echelon.sim.parts import load
-from echelon.sim.recording import CutError, read_trace
-from echelon.sim.report import RunForReport, write_report
+from echelon.sim.parts.loading import load
+from echelon.sim.recording.mcap_reader import CutError, read_trace
+from echelon.sim.report.report import RunForReport, write_report
 from echelon.sim.results.frames import FrameDecoder, frame_data
 from echelon.sim.results.rendering import read_summary
 from echelon.sim.results.run import Run

@@ -5,9 +5,9 @@ import pytest
 from bench import lockstep
 from bench.can import Robots, bus_rates, closed_in_process
 from bench.product import Row, table
-from echelon.bridge.bus import open_bus
-from echelon.bridge.bus_url import resolve_url
-from echelon.bridge.native.codec import NativeCodec, Torque
+from echelon.bridge.can.bus import open_bus
+from echelon.bridge.can.bus_url import resolve_url
+from echelon.bridge.protocols.native.codec import NativeCodec, Torque
 
 
 @pytest.mark.parametrize("peer", ["zenoh", "pipes"])

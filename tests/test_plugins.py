@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import SCENARIOS
+from support.runs import SCENARIOS
 
-import echelon.loading
+import echelon.planning.loading
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.trajectory import make_trajectory
 from echelon.errors import PartRunError
-from echelon.loading import ScenarioError
-from echelon.plan import Plan
-from echelon.sim.engine import Engine
-from echelon.sim.parts import REGISTRY, load
+from echelon.planning.loading import ScenarioError
+from echelon.plan.plan import Plan
+from echelon.sim.engines.in_process import Engine
+from echelon.sim.parts.loading import REGISTRY, load
 
 SPIRAL = """
 from math import cos, sin
@@ -31,7 +31,7 @@ class Spiral(Trajectory):
                          [-2 * w * s - w * w * t * c, 2 * w * c - w * w * t * s]])
 """
 PLANT = """
-import echelon.loading
+import echelon.planning.loading
 from echelon.agents.plant import Plant, paper_step
 
 class Sticky(Plant):
@@ -56,8 +56,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def untried(folder: Path, *overrides: str) -> Plan:
-    """Returns a plan whose parts have not been tried (echelon.sim.probe)."""
-    return echelon.loading.load(folder / "mine.toml", overrides, REGISTRY)[1]
+    """Returns a plan whose parts have not been tried (echelon.sim.parts.probe)."""
+    return echelon.planning.loading.load(folder / "mine.toml", overrides, REGISTRY)[1]
 
 
 def refused(folder: Path, *overrides: str) -> str:

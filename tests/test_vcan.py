@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from echelon.bridge.bus_url import interface_is_up
+from echelon.bridge.can.bus_url import interface_is_up
 
 ROOT = Path(__file__).parents[1]
 INSIDE = ROOT / "tests" / "vcan"

@@ -14,7 +14,7 @@ TIMEOUT_S = 30.0
 
 
 class _Handler:
-    """Runs a role in the handler of the messages it waits for, as `echelon.runner` does."""
+    """Runs a role in the handler of the messages it waits for, as `echelon.runtime.runner` does."""
 
     def __init__(self, senders: dict[str, int]) -> None:
         self._waiting: dict[str, deque[bytes]] = {channel: deque() for channel in senders}
@@ -56,7 +56,7 @@ class _Handler:
 
 def run(ticks: int, folder: Path) -> None:
     """Run the exchange."""
-    from echelon.session import Session, loopback_endpoints
+    from echelon.runtime.session import Session, loopback_endpoints
 
     endpoints = dict(zip((COORDINATOR, *LEADERS), loopback_endpoints(1 + len(LEADERS)), strict=True))
 

@@ -2,8 +2,8 @@
 
 way of the torques          bridge                                      frames are made from
 no bus                      NoBridge
-mirror                      MirrorBridge (bridge.torque_mirror)         robots' states, as the run passes by
-closed, virtual time        ClosedBridge (bridge.commander)             robots' torques, a role in the lockstep
+mirror                      MirrorBridge (bridge.roles.torque_mirror)         robots' states, as the run passes by
+closed, virtual time        ClosedBridge (bridge.roles.commander)             robots' torques, a role in the lockstep
 closed, wall clock          WallBridge, around a ClosedBridge           robots' torques, as they come
 """
 
@@ -11,10 +11,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
-from echelon.bridge.commander import Commander
+from echelon.bridge.roles.commander import Commander
 from echelon.bridge.reports import BridgeProgress, CanReport
 from echelon.messages import Message
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 
 
 class Bridge(ABC):

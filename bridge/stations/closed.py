@@ -5,20 +5,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from echelon.bridge.bus import Bus, open_bus
-from echelon.bridge.bus_url import listen_command
-from echelon.bridge.buses import bus_report, scheduled
-from echelon.bridge.canlog import CanLog
-from echelon.bridge.commander import Commander
-from echelon.bridge.fit import plan_fit
-from echelon.bridge.frame_message import TimedFrame, frames_of
-from echelon.bridge.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus_url import listen_command
+from echelon.bridge.timing.buses import bus_report, scheduled
+from echelon.bridge.can.canlog import CanLog
+from echelon.bridge.roles.commander import Commander
+from echelon.bridge.timing.fit import plan_fit
+from echelon.bridge.roles.frame_message import TimedFrame, frames_of
+from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.reports import BridgeProgress, CanReport, WheelsReport, stopped_text
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.rail import Rail, on_bus
 from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 from echelon.role import Stage
 
 LOG: Final = "can.log"

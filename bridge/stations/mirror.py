@@ -7,20 +7,20 @@ from typing import Final
 
 import numpy as np
 
-from echelon.bridge.bus import open_bus
-from echelon.bridge.bus_load import bus_load
-from echelon.bridge.bus_url import listen_command
-from echelon.bridge.buses import scheduled
-from echelon.bridge.canlog import CanLog
-from echelon.bridge.fit import plan_fit
-from echelon.bridge.frame_message import BRIDGE_NODE, add_words
-from echelon.bridge.plan_dbc import dbc_names, plan_dbc
-from echelon.bridge.protocols import make_host
+from echelon.bridge.can.bus import open_bus
+from echelon.bridge.timing.bus_load import bus_load
+from echelon.bridge.can.bus_url import listen_command
+from echelon.bridge.timing.buses import scheduled
+from echelon.bridge.can.canlog import CanLog
+from echelon.bridge.timing.fit import plan_fit
+from echelon.bridge.roles.frame_message import BRIDGE_NODE, add_words
+from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.protocols.registry import make_host
 from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped_text
 from echelon.bridge.stations.bridge import Bridge
-from echelon.bridge.torque_mirror import TorqueMirror
+from echelon.bridge.roles.torque_mirror import TorqueMirror
 from echelon.messages import STATE_FIELDS, Channel, Message
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 
 TAU_RIGHT: Final = STATE_FIELDS.index("tau_right")
 TAU_LEFT: Final = STATE_FIELDS.index("tau_left")

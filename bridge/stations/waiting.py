@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from echelon.bridge.bus import Bus, Received
+from echelon.bridge.can.bus import Bus, Received
 from echelon.messages import TORQUE_FIELDS, Channel, Message
-from echelon.plan import Plan
-from echelon.wire import WireError, count_refusal, decode
+from echelon.plan.plan import Plan
+from echelon.runtime.wire import WireError, count_refusal, decode
 
 PROGRESS_NS: Final = 200_000_000
 """How often a process tells how things stand, and looks whether it is told something."""

@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from echelon.bridge.bus import Bus
-from echelon.bridge.buses import bus_report, make_buses
-from echelon.bridge.disturbances import Disturbances
-from echelon.bridge.drive_bank import DriveBank
-from echelon.bridge.fit import plan_fit
-from echelon.bridge.frame import Frame
-from echelon.bridge.frame_message import TimedFrame
-from echelon.bridge.paced_bus import PacedBus
+from echelon.bridge.can.bus import Bus
+from echelon.bridge.timing.buses import bus_report, make_buses
+from echelon.bridge.timing.disturbances import Disturbances
+from echelon.bridge.roles.drive_bank import DriveBank
+from echelon.bridge.timing.fit import plan_fit
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.roles.frame_message import TimedFrame
+from echelon.bridge.stations.paced_bus import PacedBus
 from echelon.bridge.reports import BusReport, DrivesReport
 from echelon.bridge.stations.waiting import RunClock, drained, wait_for
-from echelon.plan import Plan, on_wall_clock
+from echelon.plan.plan import Plan, on_wall_clock
 
 
 class WallDrives:

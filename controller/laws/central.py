@@ -6,7 +6,7 @@ from echelon.controller.laws.law import law_block, make_nu, make_state, make_wei
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
-from echelon.plan import Array, Plan
+from echelon.plan.plan import Array, Plan
 
 
 class CentralLaw:

@@ -12,7 +12,7 @@ import numpy as np
 from echelon.controller.laws.law import law_block, make_nu, make_state, make_weight
 from echelon.controller.laws.linear import Linear
 from echelon.controller.transformation import desired_shape, node_matrix
-from echelon.plan import Array, BlockPlan, NodePlan, Plan
+from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from echelon.errors import PartRunError
-from echelon.plan import Array, BlockPlan, Plan
+from echelon.plan.plan import Array, BlockPlan, Plan
 from echelon.plugins import Part, Plugin
 
 

@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 
 from echelon.controller.laws.law import Block, Law, LinearGains, Nu
-from echelon.plan import Array
+from echelon.plan.plan import Array
 
 
 class Linear(Law):

@@ -50,8 +50,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from echelon.controller.laws.law import Block, Law, Nu
-from echelon.plan import Array
-from echelon.values import Positive
+from echelon.plan.plan import Array
+from echelon.scenario.values import Positive
 
 PRECISION: Final = 1e-12
 """Relative, of the solution with look-ahead"""

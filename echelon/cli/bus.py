@@ -9,7 +9,7 @@ from echelon.cli.shared import JSON, ScenarioOptions, seconds
 from echelon.errors import UsageError
 
 if TYPE_CHECKING:
-    from echelon.plan import Plan
+    from echelon.plan.plan import Plan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any, Final
 
-from echelon.bridge.bus import Bus, open_bus
-from echelon.bridge.bus_url import listen_command
-from echelon.bridge.protocols import protocol_of
+from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus_url import listen_command
+from echelon.bridge.protocols.registry import protocol_of
 from echelon.bridge.stations.waiting import RunClock
 from echelon.bridge.stations.wall_drives import WallDrives
 from echelon.errors import UsageError
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 
 LINE_S: Final = 1.0
 """Between two lines."""

@@ -12,15 +12,15 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from echelon.bridge.bus import Bus, open_bus
-from echelon.bridge.bus_url import interface_is_up, resolve_url
-from echelon.bridge.frame import Frame
-from echelon.bridge.referee import Referee, judge_log, read_run_log
+from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus_url import interface_is_up, resolve_url
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.referee.referee import Referee, judge_log, read_run_log
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import UsageError
-from echelon.plan import Plan
-from echelon.sim.can_table import CanTable, finding_text
+from echelon.plan.plan import Plan
+from echelon.sim.view.wheel_table import CanTable, finding_text
 
 TICK_S: Final = 0.1
 """Listening looks up so often though nothing comes"""

@@ -24,7 +24,7 @@ class DoctorOptions:
 def doctor(options: DoctorOptions) -> int:
     """Says what this machine can do; 1 if something is missing that every run needs."""
     from echelon.cli.scenario_file import read_scenario
-    from echelon.sim.doctor import examine, text
+    from echelon.sim.doctor.doctor import examine, text
 
     plan = read_scenario(options.scenario, options.overrides)[1] if options.scenario else None
     findings = examine(plan)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from math import cos, hypot, sin
 from typing import Final
 
-from echelon import shapes
-from echelon.bridge.fit import bus_fit
+from echelon.planning.plan_maker import shapes
+from echelon.bridge.timing.fit import bus_fit
 from echelon.errors import UsageError
-from echelon.loading import ScenarioError
-from echelon.members import MAX_ROBOTS
-from echelon.shapes import Point
-from echelon.sim.parts import parse
+from echelon.planning.loading import ScenarioError
+from echelon.planning.members import MAX_ROBOTS
+from echelon.planning.shapes import Point
+from echelon.sim.parts.loading import parse
 
 SIDE: Final = 1.0
 """Between neighbours in a group [m]"""

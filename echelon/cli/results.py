@@ -11,7 +11,7 @@ from echelon.cli.shared import JSON
 from echelon.errors import UsageError
 
 if TYPE_CHECKING:
-    from echelon.sim.recording import RecoverResult
+    from echelon.sim.recording.mcap_reader import RecoverResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +100,7 @@ def recover(options: RecoverOptions) -> int:
 
 
 def _recover_folder(options: RecoverOptions) -> int:
-    from echelon.sim.recovery import recover_run
+    from echelon.sim.recording.recovery import recover_run
 
     if options.out is not None:
         raise UsageError(f"--out {options.out}: the folder of a run is mended in place; --out is for a file")
@@ -117,7 +117,7 @@ def _recover_folder(options: RecoverOptions) -> int:
 
 
 def _recover_file(options: RecoverOptions) -> int:
-    from echelon.sim.recording import recover as mend
+    from echelon.sim.recording.mcap_reader import recover as mend
 
     target = options.out or options.what.with_name(options.what.stem + "-recovered.mcap")
     result = mend(options.what, target)

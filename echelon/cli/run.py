@@ -43,7 +43,7 @@ class RunOptions(ScenarioOptions):
 def run(options: RunOptions) -> int:
     """Runs a scenario; leaves a folder."""
     if options.engine == "processes":
-        from echelon.sim.children import warm_up
+        from echelon.sim.processes.children import warm_up
 
         warm_up()
     from echelon.cli.scenario_file import read_scenario

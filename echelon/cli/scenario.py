@@ -11,7 +11,7 @@ from echelon.cli.shared import JSON, ScenarioOptions
 from echelon.errors import UsageError
 
 if TYPE_CHECKING:
-    from echelon.plan import Plan
+    from echelon.plan.plan import Plan
 
 LONGEST_DELAY: Final = 500
 """`echelon analyse` looks for the largest stable delay up to so many ticks."""
@@ -45,7 +45,7 @@ def scenarios(options: ScenariosOptions) -> int:
 
 def _protocols() -> tuple[str, ...]:
     """Returns the drive protocols that are built in."""
-    from echelon.bridge.protocols import PROTOCOLS
+    from echelon.bridge.protocols.registry import PROTOCOLS
 
     return tuple(PROTOCOLS)
 
@@ -97,7 +97,7 @@ class ValidateOptions(ScenarioOptions):
 
 def validate(options: ValidateOptions) -> int:
     """Checks a scenario and says what it means."""
-    from echelon.bridge.fit import describe_fit
+    from echelon.bridge.timing.fit import describe_fit
     from echelon.cli.scenario_file import read_scenario
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
@@ -131,7 +131,7 @@ class AnalyseOptions(ScenarioOptions):
 def analyse(options: AnalyseOptions) -> int:
     """Computes how much delay a scenario's law bears; 1 if it is unstable without any."""
     from echelon.cli.scenario_file import read_scenario
-    from echelon.controller.sampled import largest_stable_delay, spectral_radius
+    from echelon.controller.prediction.sampled import largest_stable_delay, spectral_radius
 
     _, plan = read_scenario(options.scenario, options.overrides)
     period_s = plan.root.period_ns / 1e9
@@ -167,7 +167,7 @@ def analyse(options: AnalyseOptions) -> int:
 
 def _margins(plan: "Plan") -> dict[str, dict[str, float]]:
     """Returns each block's time scale [s] and how much delay it bears alone, in continuous time [s]."""
-    from echelon.controller.sampled import delay_margin, linear_gains
+    from echelon.controller.prediction.sampled import delay_margin, linear_gains
 
     margins = {}
     for block in plan.blocks:
@@ -188,7 +188,7 @@ class DbcOptions(ScenarioOptions):
 
 def dbc(options: DbcOptions) -> int:
     """Prints the DBC of a scenario's drives."""
-    from echelon.bridge.plan_dbc import plan_dbc
+    from echelon.bridge.protocols.plan_dbc import plan_dbc
     from echelon.cli.scenario_file import read_scenario
 
     _, plan = read_scenario(options.scenario, options.overrides)
@@ -219,8 +219,8 @@ class SchemaOptions:
 
 def schema(options: SchemaOptions) -> int:
     """Prints the schema of scenario files or of summary.json."""
-    from echelon.schema import reference_page, scenario_schema
-    from echelon.sim.parts import REGISTRY
+    from echelon.scenario.schema import reference_page, scenario_schema
+    from echelon.sim.parts.loading import REGISTRY
     from echelon.sim.results.rendering import summary_schema
 
     if options.markdown and options.what != "scenario":

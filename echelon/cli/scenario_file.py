@@ -4,11 +4,11 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from echelon.loading import ScenarioError
-from echelon.plan import Plan
-from echelon.scenario import Scenario
+from echelon.planning.loading import ScenarioError
+from echelon.plan.plan import Plan
+from echelon.scenario.tables import Scenario
 from echelon.shipped import scenario_path
-from echelon.sim.parts import load, parse
+from echelon.sim.parts.loading import load, parse
 
 STANDARD_INPUT: Final = "-"
 

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from echelon.bridge.reports import CanReport
-from echelon.plan import Plan
-from echelon.sim.can_lines import finding_text, some
-from echelon.sim.results.blocks import Blocks
+from echelon.plan.plan import Plan
+from echelon.sim.results.can_lines import finding_text, some
+from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.ending import Ending
 from echelon.sim.results.records import (

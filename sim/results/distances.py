@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.sim.results.blocks import POSITION
+from echelon.sim.results.block_series import POSITION
 from echelon.sim.results.trace import Trace
 
 Array = NDArray[np.float64]

@@ -17,10 +17,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.link import LinkCounts
-from echelon.plan import Plan
+from echelon.runtime.link import LinkCounts
+from echelon.plan.plan import Plan
 from echelon.sim.results.ages import lag_times, loop_jitter
-from echelon.sim.results.blocks import Blocks, BlockSeries
+from echelon.sim.results.block_series import Blocks, BlockSeries
 from echelon.sim.results.rates import Fit, amplitude, decay
 from echelon.sim.results.settling import ROUNDING, dwell_ns, start_error
 from echelon.sim.results.trace import Array

@@ -8,9 +8,9 @@ from typing import Any, Final
 import cantools
 import numpy as np
 
-from echelon.bridge.frame import Frame
-from echelon.bridge.plan_dbc import plan_dbc
-from echelon.plan import Plan
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.plan_dbc import plan_dbc
+from echelon.plan.plan import Plan
 from echelon.sim.results.tables import Table
 
 BusFrame = tuple[int, int, Frame]

@@ -7,11 +7,11 @@ from typing import Final, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.bridge.frame import WHEELS
-from echelon.link import LinkCounts
+from echelon.bridge.protocols.frame import WHEELS
+from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS
-from echelon.plan import Plan
-from echelon.sim.results.blocks import Blocks, BlockSeries
+from echelon.plan.plan import Plan
+from echelon.sim.results.block_series import Blocks, BlockSeries
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.ending import Ending
 from echelon.sim.results.records import (

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.sim.results.blocks import BlockSeries
+from echelon.sim.results.block_series import BlockSeries
 from echelon.sim.results.settling import ROUNDING
 from echelon.sim.results.trace import Array
 

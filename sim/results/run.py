@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.bridge.referee import read_run_log
+from echelon.bridge.referee.referee import read_run_log
 from echelon.messages import STATE_FIELDS
-from echelon.plan import Plan
-from echelon.sim.results.blocks import Blocks, BlockSeries, block_series
+from echelon.plan.plan import Plan
+from echelon.sim.results.block_series import Blocks, BlockSeries, block_series
 from echelon.sim.results.records import LinkResult, Summary
 from echelon.sim.results.tables import (
     DESIRED,
@@ -29,7 +29,7 @@ from echelon.sim.results.trace import Array, Trace
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from echelon.sim.figures import Picture
+    from echelon.sim.report.figures import Picture
 
 Value = TypeVar("Value")
 Records = NDArray[np.void]
@@ -149,7 +149,7 @@ class Run:
         return table
 
     def _torques(self, log: Path) -> Table:
-        from echelon.sim.recording import read_torques
+        from echelon.sim.recording.mcap_reader import read_torques
         from echelon.sim.results.torques import torques_table
 
         said = read_torques(log.with_name("run.mcap"), self.plan)
@@ -168,7 +168,7 @@ class Run:
     def figure(self, name: str) -> "Picture":
         """Returns a figure of the report: `trajectories`, `blocks`, `errors`, `distance` or `torques`.  Jupyter shows it;
         `save(path)` writes it as SVG.  Raises KeyError for another name."""
-        from echelon.sim.figures import picture
+        from echelon.sim.report.figures import picture
 
         return picture(name, self.trace, self._blocks)
 

@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.plan import BlockPlan, Plan
-from echelon.sim.results.blocks import BlockSeries
+from echelon.plan.plan import BlockPlan, Plan
+from echelon.sim.results.block_series import BlockSeries
 from echelon.sim.results.trace import Array
 
 ROUNDING: Final = 1e-9

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from echelon.bridge.reports import CanReport
-from echelon.link import LinkCounts
-from echelon.sim.can_lines import can_lines
-from echelon.sim.results.blocks import block_series
+from echelon.runtime.link import LinkCounts
+from echelon.sim.results.can_lines import can_lines
+from echelon.sim.results.block_series import block_series
 from echelon.sim.results.checks import Evidence, verdict
 from echelon.sim.results.distances import distances
 from echelon.sim.results.ending import endings

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
-from echelon.sim.results.blocks import Blocks, component_names
+from echelon.sim.results.block_series import Blocks, component_names
 from echelon.sim.results.records import LinkResult
 from echelon.sim.results.trace import Array, Trace
 

@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.bridge.frame import WHEELS
-from echelon.bridge.protocols import make_observer
+from echelon.bridge.protocols.frame import WHEELS
+from echelon.bridge.protocols.registry import make_observer
 from echelon.messages import TORQUE_FIELDS, field_index
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 from echelon.sim.results.frames import BusFrame
 from echelon.sim.results.tables import Table
 from echelon.sim.results.trace import Array

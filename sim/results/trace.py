@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.messages import STATE_FIELDS, Channel, Message
-from echelon.plan import Plan
+from echelon.plan.plan import Plan
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """What every drive and host must do, whatever their protocol says on the wire.
 
-To add a protocol: an entry in `PROTOCOLS`.  The tests see a robot's drives and host only through `bridge.frame` and
-`bridge.protocol`, and count what arrives, not what it looks like.
+To add a protocol: an entry in `PROTOCOLS`.  The tests see a robot's drives and host only through `bridge.protocols.frame` and
+`bridge.protocols.protocol`, and count what arrives, not what it looks like.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon.bridge.frame import Drive, Frame, Host
-from echelon.bridge.motor import LATCHING, ON_DEMAND, Fault, Motor
-from echelon.bridge.protocol import DriveProtocol
-from echelon.can_plan import DrivePlan
-from tests.bench_drives import MS, drive_plan, motor_plan
+from echelon.bridge.protocols.frame import Drive, Frame, Host
+from echelon.bridge.protocols.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.protocols.protocol import DriveProtocol
+from echelon.plan.can_plan import DrivePlan
+from support.bench_drives import MS, drive_plan, motor_plan
 
 WHEELS = (0, 1)
 PERIOD_NS = 10 * MS

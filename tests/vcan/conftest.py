@@ -2,7 +2,7 @@
 
 import pytest
 
-from echelon.bridge.bus_url import interface_is_up
+from echelon.bridge.can.bus_url import interface_is_up
 
 if not interface_is_up("vcan0"):
     collect_ignore_glob = ["test_*.py"]

@@ -11,12 +11,12 @@ import canopen
 import pytest
 from canopen.profiles.p402 import State402
 
-from echelon.bridge import cia402
-from echelon.bridge.bus import open_bus
-from echelon.bridge.cia402.drive import Cia402Drive
-from echelon.bridge.cia402.host import Cia402Host, Master
-from echelon.bridge.frame import Frame
-from tests.bench_drives import MS, Bench, drive_plan, motor_plan
+from echelon.bridge.protocols.registry import cia402
+from echelon.bridge.can.bus import open_bus
+from echelon.bridge.protocols.cia402.drive import Cia402Drive
+from echelon.bridge.protocols.cia402.host import Cia402Host, Master
+from echelon.bridge.protocols.frame import Frame
+from support.bench_drives import MS, Bench, drive_plan, motor_plan
 
 pytestmark = pytest.mark.vcan
 

@@ -14,11 +14,11 @@ from typing import Any
 import cantools
 import pytest
 
-from echelon.bridge.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
-from echelon.sim.live import Display
-from echelon.sim.parts import load
+from echelon.bridge.protocols.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
+from echelon.sim.view.live import Display
+from echelon.sim.parts.loading import load
 from echelon.sim.run import execute
-from tests.vcan.test_vcan import ip, listener, next_frame, somebody_listens
+from vcan.test_vcan import ip, listener, next_frame, somebody_listens
 
 pytestmark = pytest.mark.vcan
 

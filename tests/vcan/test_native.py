@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from echelon.bridge.bus import open_bus
-from echelon.bridge.cyclic import WheelState
-from echelon.bridge.frame import Frame
-from echelon.bridge.motor import Fault
-from echelon.bridge.native.codec import FaultCode, Feedback, NativeCodec
-from echelon.bridge.native.drive import NativeDrive
-from echelon.bridge.native.host import NativeHost
-from tests.bench_drives import MS, Bench, drive_plan
-from tests.runs import lab_dbc
+from echelon.bridge.can.bus import open_bus
+from echelon.bridge.protocols.cyclic import WheelState
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.motor import Fault
+from echelon.bridge.protocols.native.codec import FaultCode, Feedback, NativeCodec
+from echelon.bridge.protocols.native.drive import NativeDrive
+from echelon.bridge.protocols.native.host import NativeHost
+from support.bench_drives import MS, Bench, drive_plan
+from support.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan
 

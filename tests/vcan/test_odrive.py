@@ -15,12 +15,12 @@ from can.interfaces.socketcan import SocketcanBus
 from odrive_can.mock import ODriveCANMock
 from odrive_can.odrive import CanMsg, DriveError, ODriveCAN
 
-from echelon.bridge.bus import open_bus
-from echelon.bridge.frame import Frame
-from echelon.bridge.motor import Fault
-from echelon.bridge.odrive.drive import ODriveDrive
-from echelon.bridge.odrive.host import ODriveHost
-from tests.bench_drives import MS, Bench, drive_plan
+from echelon.bridge.can.bus import open_bus
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.motor import Fault
+from echelon.bridge.protocols.odrive.drive import ODriveDrive
+from echelon.bridge.protocols.odrive.host import ODriveHost
+from support.bench_drives import MS, Bench, drive_plan
 
 pytestmark = pytest.mark.vcan
 

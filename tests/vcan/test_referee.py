@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from echelon.bridge.bus import open_bus
+from echelon.bridge.can.bus import open_bus
 from echelon.cli import main
-from tests.live_robot import TORQUES, LiveRobot, one_robot
+from support.live_robot import TORQUES, LiveRobot, one_robot
 
 pytestmark = pytest.mark.vcan
 

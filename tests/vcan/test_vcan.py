@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from bench.can import bus_rates
-from echelon.bridge.bus import Bus, open_bus
-from echelon.bridge.bus_url import listen_command, resolve_url
-from echelon.bridge.native.codec import NativeCodec, Torque
-from echelon.bridge.native.host import NativeHost
-from echelon.bridge.torque_mirror import TorqueMirror
-from echelon.sim.can_checks import check_interfaces, check_vcan
-from tests.bench_drives import drive_plan
-from tests.runs import lab_dbc
+from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus_url import listen_command, resolve_url
+from echelon.bridge.protocols.native.codec import NativeCodec, Torque
+from echelon.bridge.protocols.native.host import NativeHost
+from echelon.bridge.roles.torque_mirror import TorqueMirror
+from echelon.sim.doctor.can_checks import check_interfaces, check_vcan
+from support.bench_drives import drive_plan
+from support.runs import lab_dbc
 
 pytestmark = pytest.mark.vcan
 

@@ -1,0 +1,1 @@
+"""CAN buses and logs: sockets, URLs, files.  Where python-can is imported."""

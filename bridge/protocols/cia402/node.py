@@ -1,0 +1,355 @@
+"""A CANopen node: network management, SDO, PDOs, heartbeats and errors, with a device profile in a class on top of it.
+
+- Heartbeat of the host (`1016`): watched from the first one on.  What happens when it is lost is the profile's matter,
+  and that of `1029` for the NMT state: to begin with it stays, so that the host sees what happened.
+- Whatever comes is checked; what is refused is counted by reason.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+
+from echelon.bridge.protocols.cia402 import objects
+from echelon.bridge.protocols.cia402.codec import (
+    HEARTBEAT_ID,
+    HOST_NODE,
+    NMT_ID,
+    RPDO_IDS,
+    SDO_ANSWER_ID,
+    SDO_REQUEST_ID,
+    SYNC_ID,
+    ErrorCode,
+    Nmt,
+    NmtCommand,
+    emergency,
+    heartbeat,
+    heartbeat_state,
+)
+from echelon.bridge.protocols.cia402.objects import Dictionary
+from echelon.bridge.protocols.cia402.pdo import COMMUNICATION, MAPPING, Pdo, check_change, pack, pdos
+from echelon.bridge.protocols.cia402.profile import Profile
+from echelon.bridge.protocols.cia402.sdo import LENGTH, Abort, Key, SdoError, SdoServer, abort_code
+from echelon.bridge.protocols.frame import Frame
+from echelon.plan.can_plan import NEVER_NS
+
+MS = 1_000_000
+_STATES = (objects.STATUSWORD, objects.MODE_DISPLAY, objects.ERROR_CODE, objects.ERROR_REGISTER)
+"""A change of these sends a TPDO that goes by itself."""
+
+
+class Node(Profile):
+    """A node with this id; `values` are those of objects that have no default."""
+
+    def __init__(self, node: int, values: Mapping[Key, int]) -> None:
+        self.node = node
+        self.nmt = Nmt.BOOT_UP
+        self.refused: Counter[str] = Counter()
+        self._od = Dictionary(node, values)
+        self._sdo = SdoServer(self._od.read, self._write)
+        self._now_ns = 0
+        self._begun = False
+        self._due: dict[tuple[str, int], int] = {}
+        """What happens when: boot, heartbeat, host (its heartbeat is lost), tpdo, rpdo (it did not come)."""
+        self._out: list[Frame] = []
+        self._waiting: dict[int, list[int]] = {}
+        """Values of RPDOs that wait for SYNC."""
+        self._syncs = 0
+        self._sent: dict[int, tuple[int, list[int]]] = {}
+        """When TPDOs were last sent, and what it was that makes them go by themselves."""
+        self._host_lost = False
+        self._configure()
+
+    # time
+
+    @property
+    def identifiers(self) -> frozenset[int]:
+        """Identifiers of the frames it listens to."""
+        return self._identifiers
+
+    @property
+    def due_ns(self) -> int:
+        """When it next has something to do on its own."""
+        return min(self._due.values(), default=NEVER_NS) if self._begun else -NEVER_NS
+
+    def advance(self, time_ns: int) -> list[Frame]:
+        """Lets time pass; returns what it sends on its own until then, what is due at `time_ns` included."""
+        self._pass(time_ns)
+        out, self._out = self._out, []
+        return out
+
+    def _pass(self, time_ns: int) -> None:
+        if not self._begun:
+            self._begun = True
+            self._power_on(time_ns)
+        due = self._due
+        while due:
+            what = min(due, key=due.__getitem__)
+            due_ns = due[what]
+            if due_ns > time_ns:
+                break
+            del due[what]
+            self._physics(due_ns)
+            self._happen(due_ns, *what)
+        self._physics(time_ns)
+        if self._unasked:
+            self._send_changed(time_ns)
+
+    def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
+        """Takes a frame; returns what it answers at once."""
+        out = self.advance(time_ns)
+        self._now_ns = time_ns
+        can_id, data, remote = frame
+        numbers = self._numbers.get(can_id)
+        if remote:
+            self.refused["remote frame"] += 1
+        elif numbers is not None:
+            for number in numbers:
+                self._rpdo(time_ns, self._rpdos[number], data)
+        elif can_id == self._sync_id:
+            self._sync(time_ns, data)
+        elif can_id == NMT_ID:
+            self._manage(time_ns, data)
+        elif can_id == SDO_REQUEST_ID + self.node:
+            self._request(data)
+        elif can_id in (self._host_id, HEARTBEAT_ID + HOST_NODE):
+            self._hear(time_ns, can_id, data)
+        elif can_id != SYNC_ID:
+            self.refused["PDO not valid" if can_id in self._identifiers else "identifier"] += 1
+        return out + self.advance(time_ns)
+
+    def _happen(self, time_ns: int, what: str, number: int) -> None:
+        match what:
+            case "boot":
+                self._out.append(heartbeat(self.node, Nmt.BOOT_UP))
+                self.nmt = Nmt.PRE_OPERATIONAL
+                self._beat_after(time_ns)
+                self._booted(time_ns)
+            case "heartbeat":
+                self._out.append(heartbeat(self.node, self.nmt))
+                self._beat_after(time_ns)
+            case "host":
+                self._lose_host(time_ns)
+            case "rpdo":
+                self._missed(time_ns)
+            case "tpdo":
+                self._send(time_ns, self._tpdos[number])
+
+    def _set_due(self, what: str, number: int, time_ns: int, after_ns: int) -> None:
+        """Something is due after a while; never, if that is 0."""
+        if after_ns:
+            self._due[what, number] = time_ns + after_ns
+        else:
+            self._due.pop((what, number), None)
+
+    def _drop_due(self, what: str) -> None:
+        for key in [key for key in self._due if key[0] == what]:
+            del self._due[key]
+
+    def _beat_after(self, time_ns: int) -> None:
+        self._set_due("heartbeat", 0, time_ns, self._od[objects.PRODUCER_HEARTBEAT] * MS)
+
+    # network management
+
+    def _power_on(self, time_ns: int) -> None:
+        self._od.reset()
+        self._switch_on(time_ns)
+        self._boot(time_ns)
+
+    def _boot(self, time_ns: int) -> None:
+        self.nmt = Nmt.BOOT_UP
+        self._host_lost = False
+        self._sdo.reset()
+        self._due.clear()
+        self._due["boot", 0] = time_ns
+        self._configure()
+
+    def _manage(self, time_ns: int, data: bytes) -> None:
+        if len(data) != 2:
+            self.refused["length"] += 1
+            return
+        command, node = data
+        if node not in (0, self.node):
+            return
+        match command:
+            case NmtCommand.START:
+                if self.nmt is not Nmt.OPERATIONAL:
+                    self.nmt = Nmt.OPERATIONAL
+                    self._begin_pdos(time_ns)
+            case NmtCommand.STOP:
+                self._leave(time_ns, Nmt.STOPPED)
+            case NmtCommand.PRE_OPERATIONAL:
+                self._leave(time_ns, Nmt.PRE_OPERATIONAL)
+            case NmtCommand.RESET_NODE:
+                self._leave(time_ns, Nmt.BOOT_UP)
+                self._power_on(time_ns)
+            case NmtCommand.RESET_COMMUNICATION:
+                self._leave(time_ns, Nmt.BOOT_UP)
+                self._od.reset(0x1000, 0x1FFF)
+                self._boot(time_ns)
+            case _:
+                self.refused["NMT command"] += 1
+
+    def _leave(self, time_ns: int, nmt: Nmt) -> None:
+        """Leaves the NMT state for one in which there are no PDOs."""
+        if nmt is not self.nmt:
+            self.nmt = nmt
+            self._waiting.clear()
+            self._drop_due("tpdo")
+            self._rest(time_ns)
+
+    def _hear(self, time_ns: int, can_id: int, data: bytes) -> None:
+        if heartbeat_state(data) is None:
+            self.refused["heartbeat"] += 1
+        elif can_id == self._host_id and self._host_ns:
+            self._host_lost = False
+            self._set_due("host", 0, time_ns, self._host_ns)
+
+    def _lose_host(self, time_ns: int) -> None:
+        self._host_lost = True
+        self._without_host(time_ns)
+        behaviour = self._od[objects.COMMUNICATION_ERROR]
+        if self.nmt is Nmt.OPERATIONAL and behaviour != 1:
+            self._leave(time_ns, Nmt.PRE_OPERATIONAL if behaviour == 0 else Nmt.STOPPED)
+
+    def _report(self, errors: list[ErrorCode]) -> None:
+        """Sends an emergency message for the last of the errors there are, or that there is none any more."""
+        code = errors[-1] if errors else ErrorCode.NONE
+        register = 0
+        for error in errors:
+            register |= error.register
+        od = self._od
+        od[objects.ERROR_REGISTER] = register
+        od[objects.ERROR_CODE] = code
+        if code:
+            for sub in range(objects.MAX_ERRORS, 1, -1):
+                od[objects.ERRORS, sub] = od[objects.ERRORS, sub - 1]
+            od[objects.ERRORS, 1] = code
+            od[objects.ERRORS, 0] = min(od[objects.ERRORS, 0] + 1, objects.MAX_ERRORS)
+        if self.nmt in (Nmt.PRE_OPERATIONAL, Nmt.OPERATIONAL):
+            self._out.append(emergency(self.node, code, register))
+
+    # process data
+
+    def _configure(self) -> None:
+        """Takes PDOs, SYNC and the host's heartbeat as the objects have them."""
+        od = self._od
+        self._rpdos = {pdo.number: pdo for pdo in pdos(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING)}
+        self._tpdos = {pdo.number: pdo for pdo in pdos(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING)}
+        self._numbers: dict[int, list[int]] = {}
+        for pdo in self._rpdos.values():
+            self._numbers.setdefault(pdo.can_id, []).append(pdo.number)
+        self._unasked = any(not pdo.synchronous for pdo in self._tpdos.values())
+        self._sync_id = od[objects.SYNC_COB_ID]
+        host = od[objects.CONSUMER_HEARTBEAT]
+        self._host_id, self._host_ns = HEARTBEAT_ID + (host >> 16 or HOST_NODE), (host & 0xFFFF) * MS
+        fixed = (NMT_ID, SYNC_ID, self._sync_id, HEARTBEAT_ID + HOST_NODE, self._host_id, SDO_REQUEST_ID + self.node)
+        self._identifiers = frozenset((*fixed, *self._numbers, *(base + self.node for base in RPDO_IDS)))
+
+    def _begin_pdos(self, time_ns: int) -> None:
+        self._syncs = 0
+        self._waiting.clear()
+        self._sent.clear()
+        self._drop_due("tpdo")
+        for pdo in self._tpdos.values():
+            if not pdo.synchronous:
+                self._set_due("tpdo", pdo.number, time_ns, pdo.timer_ns)
+
+    def _sync(self, time_ns: int, data: bytes) -> None:
+        if len(data) > 1:
+            self.refused["length"] += 1
+        elif self.nmt is Nmt.OPERATIONAL:
+            self._syncs += 1
+            for pdo in self._tpdos.values():
+                if pdo.synchronous and not (pdo.transmission and self._syncs % pdo.transmission):
+                    self._send(time_ns, pdo)
+            waiting, self._waiting = self._waiting, {}
+            for number, values in waiting.items():
+                self._take(time_ns, self._rpdos[number], values)
+
+    def _send(self, time_ns: int, pdo: Pdo) -> None:
+        values = [self._sample(time_ns, key) for key in pdo.keys]
+        if pdo.transmission == 0 and self._sent.get(pdo.number, (0, None))[1] == values:
+            return
+        self._sent[pdo.number] = time_ns, self._states(pdo) if pdo.transmission else values
+        self._out.append(Frame(pdo.can_id, pack(pdo, values)))
+        if not pdo.synchronous:
+            self._set_due("tpdo", pdo.number, time_ns, pdo.timer_ns)
+
+    def _states(self, pdo: Pdo) -> list[int]:
+        return [self._od[key] for key in pdo.keys if key in _STATES]
+
+    def _send_changed(self, time_ns: int) -> None:
+        """Sends TPDOs that go by themselves and whose states have changed, or lets them wait for their inhibit time."""
+        if self.nmt is not Nmt.OPERATIONAL:
+            return
+        for pdo in self._tpdos.values():
+            sent_ns, states = self._sent.get(pdo.number, (-NEVER_NS, None))
+            if pdo.synchronous or states == self._states(pdo):
+                continue
+            free_ns = sent_ns + pdo.inhibit_ns
+            if free_ns <= time_ns:
+                self._send(time_ns, pdo)
+            else:
+                self._due["tpdo", pdo.number] = min(free_ns, self._due.get(("tpdo", pdo.number), NEVER_NS))
+
+    def _rpdo(self, time_ns: int, pdo: Pdo, data: bytes) -> None:
+        if self.nmt is not Nmt.OPERATIONAL:
+            self.refused["not operational"] += 1
+        elif len(data) != pdo.layout.size:
+            self.refused["length"] += 1
+        else:
+            values = list(pdo.layout.unpack(data))
+            if not all(self._allowed(key, value) for key, value in zip(pdo.keys, values, strict=True)):
+                self.refused["value"] += 1
+            elif pdo.synchronous:
+                self._waiting[pdo.number] = values
+            else:
+                self._take(time_ns, pdo, values)
+
+    def _take(self, time_ns: int, pdo: Pdo, values: list[int]) -> None:
+        refused = 0
+        for key, value in zip(pdo.keys, values, strict=True):
+            refused += not self._set(time_ns, key, value)
+        if not refused:
+            self._took(time_ns, pdo)
+
+    # objects
+
+    def _request(self, data: bytes) -> None:
+        if len(data) != LENGTH:
+            self.refused["length"] += 1
+        elif self.nmt not in (Nmt.PRE_OPERATIONAL, Nmt.OPERATIONAL):
+            self.refused["SDO while stopped"] += 1
+        else:
+            answer = self._sdo.answer(data)
+            if answer is not None:
+                self._out.append(Frame(SDO_ANSWER_ID + self.node, answer))
+                code = abort_code(answer)
+                if code is not None:
+                    self.refused[f"SDO {Abort(code).name.lower().replace('_', ' ')}"] += 1
+
+    def _write(self, key: Key, data: bytes) -> None:
+        """Takes what SDO writes; raises SdoError."""
+        od, time_ns = self._od, self._now_ns
+        value = od.parse(key, data)
+        check_change(od, key, value)
+        if not self._allowed(key, value) or (key == objects.CONSUMER_HEARTBEAT and value >> 16 > HOST_NODE):
+            raise SdoError(Abort.VALUE)
+        if key[0] >= 0x2000:
+            if not self._set(time_ns, key, value):
+                raise SdoError(Abort.DEVICE_STATE)
+            return
+        od[key] = value
+        if key == (objects.ERRORS, 0):
+            od.reset(objects.ERRORS, objects.ERRORS)
+        elif key == objects.PRODUCER_HEARTBEAT:
+            self._beat_after(time_ns)
+        elif key == objects.CONSUMER_HEARTBEAT:
+            self._host_lost = False
+            self._drop_due("host")
+            self._configure()
+        elif key == objects.SYNC_COB_ID:
+            self._configure()
+        elif key[0] in COMMUNICATION or key[0] in MAPPING:
+            self._configure()
+            if self.nmt is Nmt.OPERATIONAL:
+                self._begin_pdos(time_ns)

@@ -1,0 +1,53 @@
+"""ODrive's CANSimple, firmware 0.6: an axis for each wheel, torque control."""
+
+from typing import TYPE_CHECKING, ClassVar
+
+from echelon.bridge.protocols.frame import Drive, Host
+from echelon.bridge.protocols.observe import Observer
+from echelon.bridge.protocols.protocol import DriveProtocol
+from echelon.plan.can_plan import DrivePlan, EnvelopePlan
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+
+class ODrive(DriveProtocol):
+    """An axis for each wheel, each a node with 32 identifiers in a row (bridge.protocols.odrive.codec)."""
+
+    nodes: ClassVar[range] = range(63)
+    empty_asks: ClassVar[bool] = True
+
+    def identifiers(self, node: int) -> frozenset[int]:
+        """Returns the identifiers of a node's 32 commands."""
+        from echelon.bridge.protocols.odrive.codec import frame_id
+
+        return frozenset(frame_id(node, command) for command in range(32))
+
+    def host(self, drive: DrivePlan) -> Host:
+        """Returns what commands a robot's axes."""
+        from echelon.bridge.protocols.odrive.host import ODriveHost
+
+        return ODriveHost(drive)
+
+    def drive(self, drive: DrivePlan, number: int) -> Drive:
+        """Returns a virtual axis."""
+        from echelon.bridge.protocols.odrive.drive import ODriveDrive
+
+        return ODriveDrive(drive, number)
+
+    def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
+        """Returns what listens to a robot's frames; where nobody answers, no heartbeat is missing."""
+        from echelon.bridge.protocols.odrive.config import ODriveConfig
+        from echelon.bridge.protocols.odrive.observe import ODriveObserver
+
+        return ODriveObserver(drive, envelope, ODriveConfig() if closed else ODriveConfig(heartbeat_msg_rate_ms=0))
+
+    def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
+        """Returns the vendor's messages for both axes."""
+        from echelon.bridge.protocols.odrive.dbc import messages
+
+        return messages(drive, name)
+
+    def resolution(self, drive: DrivePlan) -> float:
+        """Returns 0: torques are floating point."""
+        return 0.0

@@ -1,0 +1,162 @@
+"""What a passive listener makes of the frames of a robot's two ODrive axes.
+
+It knows only what is on the bus, and allows for what that cannot tell: a heartbeat says what was up to 100 ms ago, and a
+torque report is a mean over the period before it.
+"""
+
+from dataclasses import dataclass, field
+from math import tau
+from typing import Final
+
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.observe import Finding, WheelReading
+from echelon.bridge.protocols.odrive.codec import LENGTH, MESSAGES, ZERO_TORQUE, Refusal, frame_id
+from echelon.bridge.protocols.odrive.config import ODriveConfig
+from echelon.bridge.protocols.odrive.enums import AxisState, Command, error_names
+from echelon.plan.can_plan import DrivePlan, EnvelopePlan
+
+ROUNDING: Final = 1e-6
+"""Relative; more than a 32-bit float's"""
+
+
+@dataclass(slots=True)
+class _Axis:
+    """What was seen of one axis."""
+
+    wheel: WheelReading = field(default_factory=WheelReading)
+    state: int | None = None
+    asked: bool = False
+    """Set_Axis_State(8) was seen since the last heartbeat with that state"""
+    idle_ns: int | None = None
+    """It is IDLE since this heartbeat at the latest, and was not asked to leave it"""
+    alive_ns: int | None = None
+    """Last heartbeat, or the first frame of all"""
+    missing: bool = False
+    """What is missing was told"""
+    fed_ns: int | None = None
+    """Last frame that feeds the watchdog, or the first frame of all"""
+
+
+class ODriveObserver:
+    """Listens to one robot; `config` is what its axes are set up with."""
+
+    def __init__(self, plan: DrivePlan, envelope: EnvelopePlan, config: ODriveConfig | None = None) -> None:
+        self.plan = plan
+        self.envelope = envelope
+        self._axes = (_Axis(), _Axis())
+        self.wheels = (self._axes[0].wheel, self._axes[1].wheel)
+        self._by_id = {
+            frame_id(node, command): (axis, command)
+            for node, axis in zip(plan.node_ids, self._axes, strict=True)
+            for command in range(32)
+        }
+        self._identifiers = frozenset(self._by_id)
+        periods_ns = (config or ODriveConfig()).periods_ns(plan)
+        self._heartbeat_ns = periods_ns.get(Command.HEARTBEAT)
+        self._cyclic = {
+            frame_id(node, command): period
+            for node in plan.node_ids
+            for command, period in {**periods_ns, Command.SET_INPUT_TORQUE: plan.period_ns}.items()
+        }
+
+    @property
+    def identifiers(self) -> frozenset[int]:
+        """Identifiers of the frames it looks at."""
+        return self._identifiers
+
+    @property
+    def cyclic(self) -> dict[int, int]:
+        """Identifiers that must come regularly, with their periods [ns]."""
+        return self._cyclic
+
+    def observe(self, time_ns: int, frame: Frame) -> list[Finding]:
+        """Takes a frame; returns what is wrong with it."""
+        found = self._by_id.get(frame.can_id)
+        if found is None:
+            return []
+        axis, number = found
+        wrong: list[tuple[str, str]] = []
+        if axis.alive_ns is None:
+            axis.alive_ns = axis.fed_ns = time_ns
+        self._check_alive(axis, time_ns, number, wrong)
+        message = MESSAGES.get(number)
+        if message is None:
+            wrong.append(("command", f"command {number:#04x} is none of CANSimple's"))
+        elif message.command is Command.ESTOP:
+            axis.asked = False
+        elif not (frame.remote or (not frame.data and (message.reported or message.command is Command.ADDRESS))):
+            values = message.decode(frame.data)
+            if isinstance(values, Refusal) or (message.reported and len(frame.data) != LENGTH):
+                kind = values if isinstance(values, Refusal) else Refusal.LENGTH
+                wrong.append((kind, f"{message.name} with {frame.data.hex() or 'no bytes'}"))
+            else:
+                self._read(axis, time_ns, message.command, values, wrong)
+        return [Finding(time_ns, frame.can_id, str(kind), text) for kind, text in wrong]
+
+    def _check_alive(self, axis: _Axis, time_ns: int, number: int, wrong: list[tuple[str, str]]) -> None:
+        if self._heartbeat_ns is None or axis.alive_ns is None:
+            return
+        gap_ns = time_ns - axis.alive_ns
+        if gap_ns > 1.5 * self._heartbeat_ns and not axis.missing:
+            axis.missing = True
+            wrong.append(("heartbeat missing", f"none for {gap_ns / 1e6:.0f} ms"))
+        if number == Command.HEARTBEAT:
+            axis.alive_ns, axis.missing = time_ns, False
+
+    def _read(
+        self, axis: _Axis, time_ns: int, command: Command, values: tuple[float, ...], wrong: list[tuple[str, str]]
+    ) -> None:
+        wheel = axis.wheel
+        if command is Command.SET_INPUT_TORQUE:
+            wheel.commanded, wheel.commanded_ns = values[0], time_ns
+            axis.fed_ns = time_ns
+            if abs(values[0]) > self.envelope.torque_limit * (1.0 + ROUNDING):
+                wrong.append(
+                    ("torque above limit", f"{values[0]:.6g} N m, at most {self.envelope.torque_limit:.6g} N m")
+                )
+        elif command is Command.GET_TORQUES:
+            wheel.reported, wheel.reported_ns = values[1], time_ns
+            self._check_torque(axis, time_ns, values[1], wrong)
+        elif command is Command.HEARTBEAT:
+            self._heartbeat(axis, time_ns, int(values[0]), int(values[1]), wrong)
+        elif command is Command.GET_ENCODER_ESTIMATES:
+            wheel.speed = values[1] * tau
+        elif command is Command.GET_ERROR:
+            wheel.fault = error_names(int(values[0]))
+        elif command is Command.SET_AXIS_STATE:
+            axis.asked = values[0] == AxisState.CLOSED_LOOP_CONTROL
+            axis.fed_ns = time_ns
+            if axis.asked:
+                axis.idle_ns = None
+        elif command is Command.REBOOT:
+            axis.asked = False
+
+    def _check_torque(self, axis: _Axis, time_ns: int, torque: float, wrong: list[tuple[str, str]]) -> None:
+        if abs(torque) <= ZERO_TORQUE:
+            return
+        since_ns = time_ns - self.plan.period_ns  # what the mean begins with
+        if axis.idle_ns is not None and since_ns >= axis.idle_ns:
+            wrong.append(("torque while idle", f"{torque:.6g} N m"))
+        if axis.fed_ns is not None and since_ns - axis.fed_ns > self.plan.watchdog_ns:
+            wrong.append(
+                ("torque after silence", f"{torque:.6g} N m, {(time_ns - axis.fed_ns) / 1e6:.1f} ms after a command")
+            )
+
+    def _heartbeat(self, axis: _Axis, time_ns: int, errors: int, state: int, wrong: list[tuple[str, str]]) -> None:
+        try:
+            name = AxisState(state).name
+        except ValueError:
+            name = str(state)
+            wrong.append(("state", f"{state} is no axis state"))
+        axis.wheel.state, axis.wheel.fault = name, error_names(errors)
+        if state == AxisState.CLOSED_LOOP_CONTROL:
+            if axis.state != state and not axis.asked:
+                wrong.append(("enabled unasked", "CLOSED_LOOP_CONTROL without Set_Axis_State(8)"))
+            if errors:
+                wrong.append(("error while enabled", error_names(errors)))
+            axis.asked = False
+        if state != AxisState.IDLE or axis.asked:
+            axis.idle_ns = None
+        elif axis.idle_ns is None:
+            axis.idle_ns = time_ns
+        axis.state = state

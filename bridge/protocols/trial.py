@@ -1,0 +1,91 @@
+"""Tries the protocols of a plan that others wrote, before anything starts: everything is made that a run will ask for.
+
+Raises PartRunError: one line that names file, class, robot and what is wrong.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from echelon.bridge.protocols.checked import Caller
+from echelon.bridge.protocols.registry import (
+    DrivePlace,
+    cyclic_of,
+    make_drive,
+    make_host,
+    make_masters,
+    make_observer,
+    protocol_of,
+    shared_protocols,
+)
+from echelon.plan.plan import Plan, RobotPlan
+
+
+def try_protocols(plan: Plan) -> None:
+    """Makes hosts, drives, observers, masters and DBC messages of one robot for each protocol that others wrote."""
+    others = {id(robot.drive.protocol): robot for robot in reversed(plan.robots) if not robot.drive.protocol.is_own}
+    for robot in others.values():
+        _try_robot(plan, robot)
+    if others:
+        make_masters(plan)
+
+
+def _try_robot(plan: Plan, robot: RobotPlan) -> None:
+    caller, protocol, drive = Caller.of(robot), protocol_of(robot), robot.drive
+    make_host(robot).mirror(0.0, 0.0, True)
+    for wheels in protocol.wheels:
+        make_drive(plan, DrivePlace(robot.index, wheels, drive.bus, 1))
+    messages = _messages(caller, "messages", protocol.messages, drive, "robot")
+    for one in shared_protocols(plan):
+        if one.part.use == drive.protocol.use:
+            times = one.period_ns, one.watchdog_ns
+            messages += _messages(caller, "shared_messages", protocol.shared_messages, *times)
+            cyclic = caller.periods("shared_cyclic", protocol.shared_cyclic, *times)
+            _check_described(caller, "shared_cyclic", set(cyclic), messages)
+    for closed in (True, False):
+        observer = make_observer(robot, closed)
+        _check_described(caller, "observer", set(cyclic_of(robot, observer, closed)), messages)
+    caller.call("messages", _written, messages)
+    _number(caller, "resolution", caller.call("resolution", protocol.resolution, drive))
+    caller.call("boot_ups", lambda: dict(protocol.boot_ups(drive)))
+    _check_addresses(caller, caller.call("addresses", protocol.addresses, drive))
+
+
+def _messages(caller: Caller, what: str, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    from cantools.database.can import Message
+
+    found = caller.call(what, function, *arguments)
+    if not (isinstance(found, list) and all(isinstance(message, Message) for message in found)):
+        raise caller.wrong(f"{what} must return a list of cantools messages, not {found!r:.60}")
+    if other := [message.frame_id for message in found if message.frame_id not in caller.allowed]:
+        raise caller.wrong(f"{what} describes identifier {other[0]:#05x}, which `identifiers` does not name")
+    return found
+
+
+def _check_described(caller: Caller, what: str, cyclic: set[int], messages: list[Any]) -> None:
+    """What comes regularly must have a DBC message: the load of a bus is computed from it."""
+    if lacking := sorted(cyclic - {message.frame_id for message in messages}):
+        raise caller.wrong(f"{what}: identifier {lacking[0]:#05x} comes regularly, but `messages` does not describe it")
+
+
+def _check_addresses(caller: Caller, found: Any) -> None:
+    """Checks what is shown of where drives are."""
+    if not (
+        isinstance(found, dict)
+        and len(found) == 1
+        and found.keys() <= {"nodes", "identifiers"}
+        and all(
+            isinstance(numbers, dict) and all(type(n) is int for n in numbers.values()) for numbers in found.values()
+        )
+    ):
+        raise caller.wrong(f"addresses must be nodes or identifiers, numbers by name, not {found!r:.60}")
+
+
+def _written(messages: list[Any]) -> str:
+    from cantools.database import Database
+
+    return Database(messages).as_dbc_string()
+
+
+def _number(caller: Caller, what: str, value: Any) -> None:
+    if not (isinstance(value, (int, float)) and 0 <= value < float("inf")):
+        raise caller.wrong(f"{what} must be a finite number, 0 or more, not {value!r:.60}")

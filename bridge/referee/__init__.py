@@ -1,0 +1,1 @@
+"""A passive listener that holds frames against the plan."""

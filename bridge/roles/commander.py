@@ -1,0 +1,274 @@
+"""The bridge on the closed torque path, as a role: robots' torques in, frames out; feedback in, wheel torques out.
+
+Twice per torque period it has its turn.  First it hears what the drives fed back at this instant, and tells robots the
+torques that their wheels had in the period that ends.  Then it takes the robots' new torques through the envelope, lets
+the hosts make frames of them, and lets the bus carry what it can in the period (bridge.timing.arbitration): that is what the
+drives hear, each frame at its instant.
+
+Feedback is a sample of its instant: the plant, which is not on the bus, takes it without the time it spends there.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from echelon.bridge.timing.bus_load import worst_case_bits
+from echelon.bridge.timing.bus_model import BusEventKind
+from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.buses import make_buses
+from echelon.bridge.timing.disturbances import Disturbances
+from echelon.bridge.roles.envelope import Envelope
+from echelon.bridge.protocols.frame import Frame, Host
+from echelon.bridge.roles.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
+from echelon.bridge.timing.ideal_bus import IdealBus
+from echelon.bridge.protocols.registry import drive_places, make_host, make_masters
+from echelon.bridge.reports import WheelsReport
+from echelon.bridge.timing.schedule import Schedule
+from echelon.errors import PartRunError
+from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
+from echelon.plan.plan import Plan, RobotPlan
+from echelon.role import Input, Stage
+from echelon.runtime.turns import Turn
+
+_COMMANDED: Final = TORQUE_FIELDS.index("commanded")
+_SATURATED: Final = TORQUE_FIELDS.index("saturated")
+NOT_COMMANDED: Final = "no command"
+"""Why a torque is zero besides the reasons of the envelope: the robot said it has none, or nothing (fresh) came from it."""
+
+
+def _fresh(message: Heard, time_ns: int) -> list[TimedFrame]:
+    """Returns the frames of a message of this instant; a receiver holds an older one when nothing newer comes."""
+    return [] if message is None or message.time_ns != time_ns else unpack(message.values)
+
+
+class RobotChannel:
+    """The way of one robot's torques to its drives: envelope, then host; counts what it stopped, and why."""
+
+    def __init__(self, robot: RobotPlan) -> None:
+        self.robot = robot
+        self.host: Host = make_host(robot)
+        self.envelope = Envelope(robot.envelope)
+        self.stopped: Counter[str] = Counter()
+        self.commands = 0
+        self.largest = 0.0
+        self._gave = False
+        self._came_up_ns: int | None = None
+        self.spoken = False
+        """True once the robot has said something"""
+        self.torque_frames = 0
+        """So many of the last cycle's frames, the last ones, carry its torques"""
+
+    def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
+        """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
+        host = self.host
+        frames = host.poll(time_ns)
+        # What a host sends first when drives take torque (again) is zero, whatever is wanted; limits count from there.
+        enabled = host.enabled
+        gives, self._gave = enabled and self._gave, enabled
+        if enabled and self._came_up_ns is None:
+            self._came_up_ns = time_ns
+        tau_right = tau_left = 0.0
+        limited = False
+        if heard is None or (values := heard.values.tolist())[_COMMANDED] != 1.0:
+            self.envelope.stop(time_ns)
+            if self.spoken or time_ns >= self.robot.drive.watchdog_ns:  # a run begins with nothing said yet
+                self.stopped[NOT_COMMANDED] += 1
+        elif not gives:
+            self.envelope.stop(time_ns)
+        else:
+            tau_right, tau_left, reason = self.envelope.check(time_ns, heard.time_ns, values[0], values[1])
+            limited = values[_SATURATED] > 0
+            if reason is not None:
+                self.stopped[reason] += 1
+            elif (most := max(abs(tau_right), abs(tau_left))) > self.largest:
+                self.largest = most
+        self.spoken |= heard is not None
+        self.commands += time_ns >= 0
+        commands = host.command(time_ns, tau_right, tau_left, limited)
+        self.torque_frames = len(commands)
+        return frames + commands if frames else commands
+
+    def wheel_torques(self, time_ns: int) -> tuple[float, float]:
+        """Returns what the drives last reported [N m], zeros if that is older than their watchdog."""
+        reported_ns = self.host.torque_ns
+        if reported_ns is None or time_ns - reported_ns > self.robot.drive.watchdog_ns:
+            return 0.0, 0.0
+        return self.host.torque
+
+    def stop(self, time_ns: int) -> tuple[list[Frame], str]:
+        """Returns frames that take the torque away and disable the drives.  If the host of somebody else's protocol fails at
+        that, they only ask for no torque, as far as it can say that; and the text says what failed."""
+        try:
+            return self.host.stop(time_ns), ""
+        except PartRunError as error:
+            failure = str(error)
+        try:
+            return self.host.mirror(0.0, 0.0, False), failure
+        except PartRunError:
+            return [], failure  # the drives' own watchdogs are left
+
+    def report(self) -> WheelsReport:
+        """Returns the counts."""
+        return WheelsReport(
+            protocol=self.robot.drive.protocol.use,
+            commands=self.commands,
+            stopped=dict(sorted(self.stopped.items())),
+            largest=self.largest,
+            refused=dict(sorted(self.host.refused.items())),
+            came_up=None if self._came_up_ns is None else self._came_up_ns / 1e9,
+            enabled=self.host.enabled,
+            fault=self.host.fault,
+        )
+
+
+class Commander:
+    """The bridge's role in a plan with a closed torque path.
+
+    Its models of the buses have the drives' controllers in them too, unless `alone`."""
+
+    def __init__(self, plan: Plan, *, alone: bool = False) -> None:
+        bridge = plan.bridge
+        assert bridge is not None
+        self.index = bridge.index
+        self._first_ns = bridge.first_ns
+        self._period_ns = bridge.period_ns
+        self.next_ns = bridge.first_ns
+        """End of the last period that frames were made for"""
+        self.robots = [RobotChannel(robot) for robot in plan.robots]
+        self.buses: list[BusTime | IdealBus] = make_buses(plan)
+        self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
+        for robot in self.robots:
+            listeners = self._listeners[robot.robot.drive.bus]
+            listeners.update(dict.fromkeys(robot.host.identifiers, robot.host))
+        self._longest_ns = [-(-worst_case_bits(8) * 1_000_000_000 // bus.bitrate) for bus in plan.can.buses]
+        self._masters = make_masters(plan)
+        self._places = drive_places(plan)
+        self._estops = Schedule(event for event in plan.events if event.kind == "estop")
+        self._stopped: set[int] = set()
+        """Robots under an e-stop"""
+        self._disturbances = Disturbances(plan, self.buses, drives=not alone)
+        self._told = [0] * len(self.buses)
+        """How many events of each bus drives have been told of"""
+        self.refused: Counter[str] = Counter()
+        """What came as messages and cannot be"""
+        reports = () if plan.drives is None else (Input(plan.drives.index, Channel.FRAMES),)
+        torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
+        self.stages = (
+            Stage(Turn.HEAR, self._period_ns, reports, self._hear, self._first_ns),
+            Stage(Turn.SEND, self._period_ns, torques, self._send, self._first_ns),
+        )
+
+    def _hear(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Takes the drives' frames of this instant; returns the torques of all wheels in the period that ends."""
+        for message in heard:
+            for at_ns, bus, node, frame in _fresh(message, time_ns):
+                if at_ns != time_ns or bus >= len(self.buses):
+                    self.refused["frame of no drive"] += 1
+                    continue
+                model = self.buses[bus]
+                if model.send(at_ns, node, frame) and not (model.is_off(node) or model.is_off(BRIDGE_NODE)):
+                    self.receive(at_ns, bus, frame)
+        return () if time_ns < 0 else (self.wheels(time_ns),)
+
+    def receive(self, time_ns: int, bus: int, frame: Frame) -> None:
+        """Takes a frame from a bus."""
+        host = self._listeners[bus].get(frame.can_id)
+        if host is not None:
+            host.receive(time_ns, frame)
+
+    def wheels(self, time_ns: int) -> Message:
+        """Returns the torques of all wheels as last reported."""
+        torques = [torque for robot in self.robots for torque in robot.wheel_torques(time_ns)]
+        return Message(Channel.WHEELS, self.index, time_ns // self._period_ns, time_ns, np.array(torques))
+
+    def _send(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Puts the frames of this cycle on the bus; returns all frames that the buses carry until the next one."""
+        self.next_ns = time_ns + self._period_ns
+        for bus, frames in self.apply_events(time_ns):
+            self._queue(time_ns, bus, frames)
+        emptied = self._empty_queues(time_ns)
+        for robot, message in zip(self.robots, heard, strict=True):
+            self._queue(time_ns, robot.robot.drive.bus, robot.frames(time_ns, message))
+        end_ns = time_ns + self._period_ns
+        for bus, master in self._masters:
+            self._queue(time_ns, bus, master.poll(time_ns))
+        for bus, master in self._masters:
+            if (sync := master.sync()) is None:
+                continue
+            # It ends with the period, so that all drives sample then, even if another frame has just begun.
+            model = self.buses[bus]
+            lead_ns = model.duration_ns(sync) + (0 if isinstance(model, IdealBus) else self._longest_ns[bus])
+            self._queue(max(time_ns, end_ns - lead_ns), bus, [sync])
+        carried = [
+            TimedFrame(sent.end_ns, number, sent.node, sent.frame)
+            for number, bus in enumerate(self.buses)
+            for sent in bus.run(end_ns)
+        ]
+        carried += self._marks()
+        carried.sort(key=lambda timed: timed.time_ns)
+        sequence = (time_ns - self._first_ns) // self._period_ns
+        return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(emptied + carried)),)
+
+    def _empty_queues(self, time_ns: int) -> list[TimedFrame]:
+        """Loses what controllers that are off their bus still held: it must not come when it is old.  Tells the drives."""
+        emptied = []
+        for number, bus in enumerate(self.buses):
+            if bus.is_off(BRIDGE_NODE):
+                bus.clear(BRIDGE_NODE)
+            for place in self._places:
+                if place.bus == number and bus.is_off(place.node):
+                    bus.clear(place.node)
+                    emptied.append(TimedFrame(time_ns, NO_BUS, place.node, EMPTIED))
+        return emptied
+
+    def _marks(self) -> list[TimedFrame]:
+        """Returns which drives' controllers left their bus or came back, since this was last asked for."""
+        marks = []
+        for number, bus in enumerate(self.buses):
+            for time_ns, node, kind, _ in bus.events[self._told[number] :]:
+                mark = {BusEventKind.OFF: OFF, BusEventKind.RECOVERED: BACK}.get(kind)
+                if mark is not None and node != BRIDGE_NODE:
+                    marks.append(TimedFrame(time_ns, NO_BUS, node, mark))
+            self._told[number] = len(bus.events)
+        return marks
+
+    def bus_frames(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
+        """Returns, bus by bus, what is sent once per period whatever robots there are; on a wall clock, at its start."""
+        frames = []
+        for bus, master in self._masters:
+            sync = master.sync()
+            frames.append((bus, [*([] if sync is None else [sync]), *master.poll(time_ns)]))
+        return frames
+
+    def reported_since(self, time_ns: int) -> bool:
+        """True if every robot's drives have reported their torques since an instant."""
+        return all(robot.host.torque_ns is not None and robot.host.torque_ns >= time_ns for robot in self.robots)
+
+    def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
+        for frame in frames:
+            self.buses[bus].send(time_ns, BRIDGE_NODE, frame)  # what finds no room is counted there
+
+    def stop(self, time_ns: int) -> tuple[list[TimedFrame], str]:
+        """Returns frames that take the torque away from all wheels and disable their drives; and what failed, if anything."""
+        stopped = [(robot.robot.drive.bus, robot.stop(time_ns)) for robot in self.robots]
+        frames = [TimedFrame(time_ns, bus, BRIDGE_NODE, frame) for bus, (of_robot, _) in stopped for frame in of_robot]
+        return frames, next((failure for _, (_, failure) in stopped if failure), "")
+
+    def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
+        """Makes happen what the scenario has for this instant; returns the frames of an e-stop, bus by bus."""
+        frames = []
+        stopped = {robot for event in self._estops.at(time_ns)[0] for robot in event.robots}
+        for robot in sorted(stopped - self._stopped):
+            torques = self.robots[robot]
+            frames.append((torques.robot.drive.bus, torques.host.estop(time_ns)))
+        for robot in self._stopped - stopped:
+            self.robots[robot].host.start()
+        self._stopped = stopped
+        self._disturbances.apply(time_ns)
+        return frames
+
+    def reports(self) -> dict[str, WheelsReport]:
+        """Returns the reports of all robots, by name."""
+        return {robot.robot.name: robot.report() for robot in self.robots}

@@ -1,0 +1,187 @@
+"""Reading a scenario: TOML, overrides, and mistakes explained, a line each (file, key, value, what is allowed)."""
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from echelon.errors import UserError
+from echelon.planning.explain import explain, is_array, key_text, short
+from echelon.scenario.part_fields import PartContext
+from echelon.plan.plan import Plan
+from echelon.planning.plan_maker import PlanError, make_plan
+from echelon.plugins import Registry, Source
+from echelon.scenario.tables import Scenario
+
+
+class ScenarioError(UserError):
+    """Mistakes in a scenario or its overrides, a line each; the first begins with the file."""
+
+
+def load(path: Path, overrides: Sequence[str], registry: Registry) -> tuple[Scenario, Plan]:
+    """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError.
+
+    The scenario's parts come from `registry`; `echelon.sim.parts.loading.load` has one."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: is not UTF-8 text (byte {error.start})") from None
+    except OSError as error:
+        raise ScenarioError(f"{path}: {error.strerror}") from None
+    except ValueError as error:  # a path with a zero byte
+        raise ScenarioError(f"{path}: {error}") from None
+    return parse(text, str(path), overrides, registry, path.parent)
+
+
+def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, folder: Path) -> tuple[Scenario, Plan]:
+    """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, parts in files are looked for in
+    `folder`.  Raises ScenarioError."""
+    table = _table(text, name)
+    if not table and not overrides:
+        needed = [key for key, field in Scenario.model_fields.items() if field.is_required()]
+        raise ScenarioError(f"{name}: empty; a scenario needs {', '.join(needed)}")
+    changed: dict[str, str] = {}
+    refused: list[tuple[str, str]] = []
+    for override in overrides:
+        try:
+            changed[_override(table, override)] = override
+        except OverrideError as error:
+            refused.append((f"with --set {short(override)}", str(error)))
+    if refused:
+        raise _scenario_error(name, refused)
+    try:
+        scenario = Scenario.model_validate(table, context=PartContext(registry, folder))
+        return scenario, make_plan(scenario, registry)
+    except ValidationError as error:
+        mistakes = explain(error.errors(include_url=False), Scenario)
+        found = [(key_text(mistake.keys), mistake.text) for mistake in mistakes]
+    except PlanError as error:
+        found = [(line.split(" = ")[0].split(":")[0], line) for line in error.lines]
+    except RecursionError:
+        found = [("formation", "formation: groups are nested too deep")]
+    raise _scenario_error(name, [(_overridden(key, changed), text) for key, text in found])
+
+
+def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioError:
+    """Returns the error that tells mistakes: each with the override it comes from, or an empty string."""
+    (where, text), *others = dict.fromkeys(mistakes)
+    first = f"{name} {where}: {text}" if where else f"{name}: {text}"
+    return ScenarioError(first, *(f"{where}: {text}" if where else text for where, text in others))
+
+
+def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None) -> str:
+    """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario.
+
+    `names` are other names for files of parts."""
+    import tomlkit  # which takes long, and is needed by those who write alone
+
+    return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True, context=names))
+
+
+def _table(text: str, name: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{name}: not TOML: {error}") from None
+    except RecursionError:
+        raise ScenarioError(f"{name}: not TOML that can be read: nested too deep") from None
+    except ValueError:  # Python's limit to the digits of an integer
+        raise ScenarioError(f"{name}: an integer has too many digits") from None
+
+
+class OverrideError(ValueError):
+    """An override that cannot be applied."""
+
+
+_INDEX = re.compile(r"\s*\[\s*([0-9]{1,9})\s*\](?=\s*(?:[.\[]|$))")
+"""The number of an entry in brackets, at the end of a chunk"""
+
+
+def _override(table: dict[str, Any], override: str) -> str:
+    """Sets one value, as in `law.epsilon=[0.1, 0.2]`, `links.0.delay=0.006` or `links[0].delay=0.006`; returns its key.
+
+    Where an array holds one table alone, its number may be left out: `links.delay=0.006`."""
+    key, equals, text = override.partition("=")
+    chunks = [chunk.strip() for chunk in _INDEX.sub(r".\1", key).split(".")]
+    if not equals or not all(chunks):
+        raise OverrideError("must read key=value, e.g. law.epsilon=[0.1, 0.2]")
+    chunks = _numbered(table, chunks)
+    at: Any = table
+    for chunk, following in pairwise(chunks):
+        empty: Any = [] if _is_number(following) else {}
+        if isinstance(at, list):
+            index = _index(at, chunk)
+            at.extend([empty] if index == len(at) else [])
+            at = at[index]
+        elif isinstance(at, dict):
+            at = at.setdefault(chunk, empty)
+        else:
+            break
+    last = chunks[-1]
+    if isinstance(at, list):
+        index = _index(at, last)
+        at[index : index + 1] = [_value(text)]
+    elif isinstance(at, dict):
+        at[last] = _value(text)
+    else:
+        raise OverrideError(f"{short(last)} would stand in a value, not in a table")
+    return key_text(chunks)
+
+
+def _numbered(table: dict[str, Any], chunks: Sequence[str]) -> list[str]:
+    """Returns a path of keys with the numbers that were left out of it.  Raises OverrideError where it is not clear which."""
+    path: list[str] = []
+    at: Any = table
+    for chunk in chunks:
+        if not _is_number(chunk) and is_array(path, Scenario) and (at is None or _holds_tables(at)):
+            entries = at or []
+            if len(entries) != 1:
+                array, rest = ".".join(path), ".".join(chunks[len(path) :])
+                have = f"{len(entries)} entries" if entries else "no entry yet"
+                last = f", …, {array}.{len(entries) - 1}.{short(rest)}" if len(entries) > 2 else ""
+                also = f" or {array}.1.{short(rest)}" if len(entries) == 2 else ""
+                raise OverrideError(f"{array} has {have}; give its number: {array}.0.{short(rest)}{also}{last}")
+            path.append("0")
+            at = entries[0]
+        path.append(chunk)
+        if isinstance(at, list):
+            at = at[int(chunk)] if _is_number(chunk) and int(chunk) < len(at) else None
+        else:
+            at = at.get(chunk) if isinstance(at, dict) else None
+    return path
+
+
+def _holds_tables(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
+
+
+def _is_number(chunk: str) -> bool:
+    return chunk.isascii() and chunk.isdecimal() and len(chunk) <= 9
+
+
+def _index(array: list[Any], chunk: str) -> int:
+    """Returns the index that a chunk names: of an entry, or of the one that would come next."""
+    if not _is_number(chunk) or int(chunk) > len(array):
+        raise OverrideError(f"{short(chunk)} must be a number from 0 to {len(array)}, for an entry or the next one")
+    return int(chunk)
+
+
+def _value(text: str) -> Any:
+    """Returns the value that a text stands for: TOML, or else the text itself, so that strings need no quotes."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text.strip()
+    return table["value"] if len(table) == 1 else text.strip()
+
+
+def _overridden(key: str, changed: dict[str, str]) -> str:
+    """Returns `with --set …` if what stands at a key comes from an override, or holds something that does."""
+    for path, override in reversed(changed.items()):
+        if f"{key}.".startswith(f"{path}.") or f"{path}.".startswith(f"{key}."):
+            return f"with --set {short(override)}"
+    return ""

@@ -1,0 +1,246 @@
+"""The members of a plan: walks the scenario's tree, hands down what robots inherit, and numbers robots and nodes."""
+
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from math import isfinite, radians
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from echelon.planning.plan_maker import shapes
+from echelon.plan.can_plan import CanPlan
+from echelon.scenario.can_tables import DriveTable
+from echelon.planning.drives import DriveMaker, make_can
+from echelon.errors import Mistakes
+from echelon.plan.plan import NodePlan, PlanError, RobotPlan, ShapePlan
+from echelon.plugins import Part, Registry
+from echelon.scenario.tables import Group, RobotTable, Scenario, Shape
+from echelon.scenario.values import Table
+
+ROBOT_DEFAULTS: Final[dict[str, Any]] = {
+    "heading": 0.0,
+    "torque_limit": float("inf"),
+    "torque_rate_limit": float("inf"),
+    "wheel_speed_limit": float("inf"),
+}
+DEFAULT_PLANT: Final = "paper"
+NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
+"""What must be said of every robot, on some level."""
+MAX_ROBOTS: Final = 127
+"""As many as a bus has identifiers for where each robot has three of its own."""
+MAX_NS: Final = 2**62
+"""146 years: sums of two instants still fit the message header."""
+
+
+def nanoseconds(seconds: float, key: str) -> int:
+    """Returns a duration in nanoseconds.  Raises PlanError unless that is a whole number, rounding of sums aside."""
+    exact = Decimal(repr(seconds)) * 10**9  # of the digits as written: a float of many seconds lacks some
+    if not 1 <= exact < MAX_NS or abs(exact - round(exact)) > Decimal("1e-3"):
+        raise PlanError(f"{key} = {seconds}: must be a whole number of nanoseconds, at least 1 and less than {MAX_NS}")
+    return round(exact)
+
+
+def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...], CanPlan]:
+    """Returns robots and nodes by their numbers, and the buses that the robots' drives are on.  Raises PlanError."""
+    count = _count_robots(scenario.formation)
+    if count > MAX_ROBOTS:
+        raise PlanError(f"formation: {count} robots, but a bus has identifiers for {MAX_ROBOTS}")
+    torque_ns = nanoseconds(scenario.periods.torque, "periods.torque")
+    can = make_can(scenario.can, torque_ns)
+    walk = _Walk(
+        acceleration_ns=nanoseconds(scenario.periods.acceleration, "periods.acceleration"),
+        torque_ns=torque_ns,
+        first_node=count,
+        drives=DriveMaker(scenario.can, can, registry.default("protocols")),
+        closed=can.closed,
+        default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
+    )
+    walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
+    walk.check()
+    return walk.drives.placed(walk.robots), tuple(walk.nodes), can
+
+
+def robot_key(path: str) -> str:
+    """Returns the key of a robot in the scenario: `formation.groups.g1.robots.r2` of `g1/r2`."""
+    *groups, robot = path.split("/")
+    return ".".join(["formation", *(f"groups.{group}" for group in groups), "robots", robot])
+
+
+def _count_robots(group: Group) -> int:
+    return len(group.robots) + sum(_count_robots(sub) for sub in group.groups.values())
+
+
+def _count_nodes(group: Group) -> int:
+    return 1 + sum(_count_nodes(sub) for sub in group.groups.values())
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a member stands: its key in the scenario, its path in the tree, its parent, which child of it, how deep."""
+
+    key: str
+    path: str
+    parent: int | None
+    child_number: int
+    depth: int
+
+
+class _Walk:
+    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them.
+
+    Mistakes are noted on the way; what was made is worth nothing until `check` has said that there are none."""
+
+    def __init__(
+        self,
+        acceleration_ns: int,
+        torque_ns: int,
+        first_node: int,
+        drives: DriveMaker,
+        closed: bool,
+        default_plant: Part[Any],
+    ) -> None:
+        self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
+        self.drives, self._closed, self._default_plant = drives, closed, default_plant
+        self._mistakes = Mistakes()
+        self._of_robots: dict[str, list[str]] = {}  # what is wrong, behind the robot's key: the keys of those robots
+        self.robots: list[RobotPlan] = []
+        self.nodes: list[NodePlan] = []
+
+    def check(self) -> None:
+        """Raises PlanError if there were mistakes.  What many robots inherit is told of the first one."""
+        for text, keys in self._of_robots.items():
+            same = f"; the same holds for {len(keys) - 1} more" if len(keys) > 1 else ""
+            self._mistakes.lines.append(f"{keys[0]}{text}{same}")
+        self._mistakes.check(PlanError)
+
+    def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
+        """Adds a group and all below it; returns its node."""
+        index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
+        first_robot = len(self.robots)
+        inherited = _overlaid(inherited, group.robot)
+        period_key = "periods.acceleration" if group.period is None else f"{place.key}.period"
+        period_ns = self._acceleration_ns if group.period is None else 0
+        with self._mistakes.noted():
+            if group.period is not None:
+                period_ns = nanoseconds(group.period, period_key)
+            if period_ns % self._torque_ns:
+                raise PlanError(
+                    f"periods.torque = {self._torque_ns / 1e9}: must divide {period_key} = {period_ns / 1e9}"
+                )
+        below = _Place(place.key, f"{place.path}/" if place.path else "", index, 0, place.depth + 1)
+        children: list[int] = []
+        weights: list[int] = []
+        for name, table in group.robots.items():
+            at = replace(below, key=f"{place.key}.robots.{name}", path=below.path + name, child_number=len(children))
+            children.append(len(self.robots))
+            weights.append(1)
+            try:
+                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
+            except PlanError as error:
+                for line in error.lines:
+                    self._of_robots.setdefault(line.removeprefix(at.key), []).append(at.key)
+        for name, sub in group.groups.items():
+            at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
+            child = self.add_group(sub, at, inherited)
+            children.append(child.index)
+            weights.append(child.robots)
+            with self._mistakes.noted():
+                if child.period_ns and period_ns % child.period_ns:
+                    raise PlanError(
+                        f"{period_key} = {period_ns / 1e9}: must be a multiple of {child.period_ns / 1e9}, "
+                        f"the period of {child.name}"
+                    )
+        shape = ShapePlan("points", ())
+        with self._mistakes.noted():
+            shape = _shape(group.shape, len(children), f"{place.key}.shape")
+        node = NodePlan(
+            index=index,
+            path=place.path,
+            parent=place.parent,
+            child_number=place.child_number,
+            children=tuple(children),
+            weights=tuple(weights),
+            first_robot=first_robot,
+            depth=place.depth,
+            period_ns=period_ns,
+            shape=shape,
+        )
+        self.nodes.append(node)
+        return node
+
+    def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
+        if lacking := [needed for needed in NEEDED if needed not in values]:
+            nowhere = "missing (neither here, nor in its group, nor in [robot])"
+            raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
+        if values["offset"] == 0:
+            raise PlanError(f"{place.key}.offset = 0: must not be zero, or the wheels cannot steer the reference point")
+        least = values["mass"] * values["offset"] * values["offset"]
+        if values["inertia"] <= least:
+            raise PlanError(
+                f"{place.key}.inertia = {values['inertia']}: must be larger than mass·offset² = {least:.6g}"
+            )
+        assert place.parent is not None
+        index = len(self.robots)
+        cycle_ns = self._torque_ns if self._closed else period_ns
+        return RobotPlan(
+            index=index,
+            envelope=self.drives.envelope(values),
+            drive=self.drives.drive(table.drive or DriveTable(), values, place.key, index, place.path, cycle_ns),
+            path=place.path,
+            parent=place.parent,
+            child_number=place.child_number,
+            period_ns=period_ns,
+            torque_period_ns=self._torque_ns,
+            model=table.model or self._default_plant,
+            **values,
+        )
+
+
+_T = TypeVar("_T", bound=Table)
+
+
+def _overlaid(table: _T, over: _T) -> _T:
+    """Returns a table with what another says in its place, key by key, in the tables within it too."""
+    merged = {}
+    for key in type(table).model_fields:
+        below, above = getattr(table, key), getattr(over, key)
+        if isinstance(below, Table) and isinstance(above, Table):
+            merged[key] = _overlaid(below, above)
+        else:
+            merged[key] = below if above is None else above
+    return table.model_copy(update=merged)
+
+
+def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:
+    """Returns the desired shape of a node with `count` children."""
+    if shape is None:
+        return ShapePlan("points", ((0.0, 0.0),))
+    points, kind, needed = _points(shape, count), "points", count
+    if shape.kind == "vectors":
+        kind, needed = "vectors", count - 1
+    if len(points) != needed:
+        what = f"{shape.kind}: " if shape.kind in ("points", "vectors") else f"kind = {shape.kind!r}: "
+        raise PlanError(f"{key}.{what}{len(points)} of them do not fit a group of {count}, which takes {needed}")
+    turned = tuple(shapes.rotated(points, shape.rotation))
+    if not all(isfinite(number) for point in turned for number in point):
+        raise PlanError(f"{key}: too large to be computed with")
+    return ShapePlan(kind, turned)
+
+
+def _points(shape: Shape, count: int) -> list[shapes.Point]:
+    side, spacing = shape.side or 0.0, shape.spacing or 0.0
+    match shape.kind:
+        case "triangle":
+            return shapes.triangle(side)
+        case "polygon":
+            return shapes.polygon(count, side)
+        case "line":
+            return shapes.line(count, spacing)
+        case "column":
+            return shapes.column(count, spacing)
+        case "wedge":
+            return shapes.wedge(count, spacing, radians(shape.angle))
+        case "vectors":
+            return shape.vectors or []
+        case "points":
+            return shape.points or []

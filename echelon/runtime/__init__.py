@@ -1,0 +1,1 @@
+"""What carries messages between roles: links, mailboxes, the wire, Zenoh sessions, and who has which turn."""

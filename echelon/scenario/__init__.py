@@ -1,0 +1,1 @@
+"""What a user writes: the tables of a scenario, as pydantic models."""

@@ -1,0 +1,258 @@
+"""The scenario's keys for editors (a JSON schema) and for people (a page of Markdown), from the tables themselves.
+
+A key's description is the docstring below it.  Those are read from the source when somebody asks: pydantic could do it
+(`use_attribute_docstrings`), but for every table of every run, which makes each start 30 ms longer.
+"""
+
+import ast
+import inspect
+import json
+from collections.abc import Iterator
+from typing import Any, Final
+
+from pydantic import BaseModel
+
+from echelon.scenario.part_fields import BESIDE, KIND, PART
+from echelon.plugins import Plugin, Registry
+from echelon.scenario.tables import Scenario
+from echelon.scenario.values import Table
+
+Schema = dict[str, Any]
+USE: Final = "Part"
+_USE: Final[Schema] = {
+    "title": USE,
+    "type": "object",
+    "description": "A part that is built in, installed, or a class in a Python file",
+    "properties": {
+        "use": {
+            "type": "string",
+            "description": "One that is built in or installed, or `file.py:Class`, the file relative to the scenario's",
+        },
+        "parameters": {"type": "object", "description": "What the part's class says"},
+    },
+    "required": ["use"],
+    "additionalProperties": False,
+}
+WITH_KIND: Final = "trajectories"
+"""Parts whose name is the `kind` of a table, with their parameters beside it"""
+WRITTEN: Final = {"laws": "law.use", "plants": "robot.model.use", "protocols": "robot.drive.protocol.use"}
+"""Where the other parts are named"""
+DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+HEAD: Final = """\
+# Scenario files
+
+All keys of a scenario, made from their source by `make docs`.  `echelon schema scenario` prints the same as a JSON schema
+for editors, `echelon validate FILE` checks a file, and `echelon new NAME` writes one to begin with.
+
+A part of your own (a trajectory, a plant) is a class in a Python file beside the scenario:
+`trajectory = { use = "my_paths.py:Spiral", parameters = { … } }`.
+
+"""
+
+
+def scenario_schema(registry: Registry) -> Schema:
+    """Returns the JSON schema of scenario files, with the docstring of each key as its description; parts that are built in are
+    those of `registry`."""
+    schema = Scenario.model_json_schema(mode="serialization")
+    schema["$defs"] |= {USE: _USE}
+    docs = {model.__name__: _docstrings(model) for model in _tables(Table)}
+    docs[USE] = {key: value["description"] for key, value in _USE["properties"].items()}
+    for group, name, part in _built_in(registry):
+        schema["$defs"][part.__name__] = _part(group, name, part)
+        docs[part.__name__] = {KIND: f"`{name}`"} | _docstrings(part)
+    schema = _plain(_with_parts(schema, registry))
+    schema["$defs"]["Law"]["allOf"] = [
+        {
+            "if": {"properties": {"use": {"const": name}}, "required": ["use"]},
+            "then": {"properties": {"parameters": {"$ref": f"#/$defs/{part.__name__}"}}},
+        }
+        for group, name, part in _built_in(registry)
+        if group == "laws"
+    ]
+    for name, table in {Scenario.__name__: schema, **schema["$defs"]}.items():
+        for key, value in table["properties"].items():
+            value["description"] = docs[name][key]
+    return {"$schema": DIALECT, **schema}
+
+
+def _built_in(registry: Registry) -> Iterator[tuple[str, str, type[Plugin]]]:
+    """Yields the parts that are built in and have parameters, or else their `kind`, to write: group, name, class."""
+    for group in registry.groups.values():
+        for name, part in group.built_in.items():
+            if part.model_fields or group.name in (WITH_KIND, "laws"):
+                yield group.name, name, part
+
+
+def _part(group: str, name: str, part: type[Plugin]) -> Schema:
+    """Returns the table of the parameters of a part that is built in, with its `kind` where that stands beside them."""
+    table = part.model_json_schema()
+    assert "$defs" not in table, "parameters of parts are plain values"
+    if group != WITH_KIND:
+        return {"properties": {}, **table}
+    properties = {KIND: {"const": name, "type": "string"}, **table.get("properties", {})}
+    return {**table, "properties": properties, "required": [KIND, *table.get("required", ())]}
+
+
+def _with_parts(schema: Any, registry: Registry) -> Any:
+    """Returns a schema with what may be written in the place of each part."""
+    if isinstance(schema, list):
+        return [_with_parts(part, registry) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if PART not in schema:
+        return {key: _with_parts(value, registry) for key, value in schema.items()}
+    built_in, use = registry.groups[schema[PART]].built_in, {"$ref": f"#/$defs/{USE}"}
+    other = {"type": "string", "not": {"enum": list(built_in)}}  # an installed one, which may take any parameters
+    if schema[BESIDE] is None:
+        return {"oneOf": [{"enum": list(built_in)}, other]}
+    if schema[BESIDE]:
+        installed = {"type": "object", "properties": {KIND: other}, "required": [KIND]}
+        return {"oneOf": [*({"$ref": f"#/$defs/{part.__name__}"} for part in built_in.values()), installed, use]}
+    return {"oneOf": [{"enum": list(built_in)}, other, use]}
+
+
+def reference_page(registry: Registry) -> str:
+    """Returns a page with a section for each table of a scenario: where it stands, its keys, their values and defaults."""
+    schema = scenario_schema(registry)
+    sections = []
+    for name, places in _places(schema).items():
+        table = schema if name == Scenario.__name__ else schema["$defs"][name]
+        where = ", ".join(f"`{place}`" for place in places)
+        if kind := table["properties"].get("kind", {}).get("const"):
+            where += f", kind `{kind}`"
+        sections.append(f"## {where or 'The file'}\n\n{_text(table['description'])}\n\n{_rows(table)}")
+    for group, name, part in _built_in(registry):
+        if group != WITH_KIND and part.model_fields:
+            table = schema["$defs"][part.__name__]
+            where = f"`parameters` of `{WRITTEN[group]} = {json.dumps(name)}`"
+            sections.append(f"## {where}\n\n{_text(table['description'])}\n\n{_rows(table)}")
+    return HEAD + "\n".join(sections)
+
+
+def _tables(table: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    for model in table.__subclasses__():
+        yield model
+        yield from _tables(model)
+
+
+def _docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """Returns the docstrings below the attributes of a class."""
+    (tree,) = ast.parse(inspect.getsource(model)).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for statement, below in zip(tree.body, tree.body[1:], strict=False):
+        match statement, below:
+            case ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text))):
+                found[key] = " ".join(text.split())
+    return found
+
+
+def _plain(schema: Any) -> Any:
+    """Returns a schema without what says nothing in TOML: null, which it does not have, titles, which repeat keys, and
+    defaults of tables, whose keys have their own."""
+    if isinstance(schema, list):
+        return [_plain(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if "anyOf" in schema:
+        one, *others = [part for part in schema["anyOf"] if part.get("type") != "null"]
+        assert not others, "no key takes several kinds that are not told apart"
+        schema = {key: value for key, value in schema.items() if key not in ("anyOf", "default")} | one
+    if "patternProperties" in schema:
+        schema = schema | {"additionalProperties": False}
+    is_table = schema.get("type") == "object" and "properties" in schema
+    return {
+        key: {name: _plain(part) for name, part in value.items()} if key in ("properties", "$defs") else _plain(value)
+        for key, value in schema.items()
+        if (key != "title" or is_table) and not (key == "default" and isinstance(value, dict))
+    }
+
+
+def _places(schema: Schema) -> dict[str, list[str]]:
+    """Returns the tables, each followed by those in it, with all places where each may stand."""
+    places: dict[str, list[str]] = {Scenario.__name__: []}
+
+    def walk(place: str, table: Schema) -> None:
+        for key, value in table["properties"].items():
+            for end, name in _references(value):
+                there = f"{place}.{key}{end}".removeprefix(".")
+                known = name in places
+                places.setdefault(name, []).append(there)
+                if not known:
+                    walk(there, schema["$defs"][name])
+
+    walk("", schema)
+    return places
+
+
+def _references(value: Schema) -> Iterator[tuple[str, str]]:
+    """Yields the tables that a value may be, with what stands behind the key then."""
+    if "$ref" in value:
+        yield "", value["$ref"].rpartition("/")[2]
+    for part in value.get("oneOf", ()):
+        yield from _references(part)
+    for part in value.get("patternProperties", {}).values():
+        yield from ((f".NAME{end}", name) for end, name in _references(part))
+    if isinstance(value.get("items"), dict):
+        yield from ((f"[]{end}", name) for end, name in _references(value["items"]))
+
+
+def _rows(table: Schema) -> str:
+    lines = ["| key | value | default | what it is |", "|---|---|---|---|"]
+    for key, value in table["properties"].items():
+        default = "needed" if key in table.get("required", ()) else _default(value.get("default"))
+        lines.append(f"| `{key}` | {_values(value)} | {default} | {_text(value['description'])} |")
+    return "\n".join(lines) + "\n"
+
+
+def _default(value: Any) -> str:
+    return "" if value is None or isinstance(value, dict) else _literal(value)
+
+
+def _literal(value: Any) -> str:
+    return f"`{json.dumps(value, ensure_ascii=False)}`"
+
+
+def _values(value: Schema) -> str:
+    """Returns in words what a key may be."""
+    if "const" in value:
+        return _literal(value["const"])
+    if "enum" in value:
+        return ", ".join(map(_literal, value["enum"]))
+    if "oneOf" in value:
+        return "; or ".join(dict.fromkeys(_values(part) for part in value["oneOf"]))
+    if "$ref" in value:
+        return "table"
+    match value["type"]:
+        case "array" if "prefixItems" in value:
+            first, *others = (_values(part) for part in value["prefixItems"])
+            return f"[{', '.join([first, *others])}]" if "," not in first else f"[…, …], each a {first}"
+        case "array":
+            return f"array of {_values(value['items'])}"
+        case "object":
+            return "tables by name" if "patternProperties" in value else "table"
+        case "string":
+            return "name" if "pattern" in value else "string"
+        case "boolean":
+            return "`true`, `false`"
+        case kind:
+            return _range("whole number" if kind == "integer" else "number", value)
+
+
+def _range(what: str, value: Schema) -> str:
+    bounds = {
+        "exclusiveMinimum": "more than",
+        "minimum": "at least",
+        "exclusiveMaximum": "less than",
+        "maximum": "at most",
+    }
+    said = [f"{words} {_limit(value[key])}" for key, words in bounds.items() if key in value]
+    return f"{what}, {', '.join(said)}" if said else what
+
+
+def _limit(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.10g}"
+
+
+def _text(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")

@@ -1,0 +1,214 @@
+"""What this machine can do: `echelon doctor`.  Each check really tries what a run needs, and says what to do where it fails.
+
+Nothing here needs root, changes the machine, or takes longer than its time limit.
+"""
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from echelon.plan.plan import Plan
+from echelon.runtime.session import Session, loopback_endpoints
+from echelon.sim.doctor.can_checks import check_fit, check_interfaces, check_multicast, check_tools, check_vcan
+from echelon.sim.doctor.finding import LIMIT_S, Finding
+
+PACKAGES: Final = ("eclipse-zenoh", "python-can", "numpy", "scipy", "cantools", "mcap", "pydantic")
+OLDEST: Final = (3, 11)
+SLEEPS: Final = 200
+SLEEP_S: Final = 0.001
+LATE_S: Final = 0.002
+"""Who is woken later than this cannot keep periods of a few milliseconds."""
+BUFFER: Final = 4 << 20
+"""What the bridge asks for, to hold a burst while it waits for its turn [bytes]"""
+SPACE: Final = 1 << 30
+"""Fewer free bytes are soon full of recordings"""
+BUSY: Final = 0.6
+"""Share of the processors above which work piles up behind deadlines"""
+HANDLING: Final = 2.0
+"""What a message costs the processes at its ends and the recorder, in times of its way there and back: paper.toml with
+recorder and CAN keeps two processors busy for 1.3 ms per tick of 24 messages"""
+
+
+@dataclass(slots=True)
+class Measured:
+    """What checks measured that others need."""
+
+    jitter_s: float = 0.0
+    round_trip_s: float = 0.0
+
+
+def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Finding]:
+    """Makes all checks, those of a plan too if there is one; `folder` is where recordings would go."""
+    measured = Measured()
+    checks: list[tuple[str, Callable[[], Finding]]] = [
+        ("Python", check_python),
+        ("processors", check_processors),
+        ("waking", lambda: check_waking(measured)),
+        ("Zenoh", lambda: check_zenoh(measured)),
+        ("vcan0", check_vcan),
+        ("multicast", check_multicast),
+        ("socket buffers", check_buffers),
+        ("CAN tools", check_tools),
+        ("disk", lambda: check_disk(folder or Path())),
+    ]
+    findings = [_limited(what, check) for what, check in checks]
+    findings += check_interfaces()
+    if {finding.what for finding in findings if finding.state != "ok"} >= {"vcan0", "multicast"}:
+        findings.append(Finding("CAN bus", "problem", "neither vcan0 nor multicast: frames reach no other process"))
+    if plan is not None:
+        if plan.can.enabled:
+            findings += check_fit(plan)
+        findings.append(_limited("wall clock", lambda: check_wall_clock(plan, measured)))
+    return findings
+
+
+def text(findings: list[Finding]) -> str:
+    """Returns findings as lines for a terminal, and a verdict."""
+    width = max(len(finding.what) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.state:<7}  {finding.what:<{width}}  {finding.text}")
+        lines += [f"{'':<{width + 9}}  → {advice}" for advice in finding.advice]
+    problems = [finding.what for finding in findings if finding.state == "problem"]
+    lines.append(f"NOT USABLE: {', '.join(problems)}" if problems else "usable")
+    return "\n".join(lines)
+
+
+def _limited(what: str, check: Callable[[], Finding]) -> Finding:
+    """Makes a check in a thread of its own, so that none can hang the others."""
+    found: list[Finding] = []
+
+    def run() -> None:
+        try:
+            found.append(check())
+        except Exception as error:
+            found.append(Finding(what, "problem", f"{type(error).__name__}: {error}"))
+
+    thread = threading.Thread(target=run, name=what, daemon=True)
+    thread.start()
+    thread.join(LIMIT_S)
+    return found[0] if found else Finding(what, "problem", f"no answer within {LIMIT_S:g} s")
+
+
+def check_python(packages: tuple[str, ...] = PACKAGES) -> Finding:
+    """Python and the packages that a run is made of."""
+    versions, missing = [f"Python {platform.python_version()}"], []
+    for package in packages:
+        try:
+            versions.append(f"{package} {importlib.metadata.version(package)}")
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(package)
+    if missing or sys.version_info < OLDEST:
+        lacks = f"; not installed: {', '.join(missing)}" if missing else ""
+        return Finding("Python", "problem", ", ".join(versions) + lacks, ("make setup, with Python 3.11 or newer",))
+    return Finding("Python", "ok", ", ".join(versions))
+
+
+def check_processors() -> Finding:
+    """Processors and what else they do."""
+    cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    said = f"{cores} to run on, load {load:.2f}, Linux {platform.release()}"
+    if load > cores:
+        return Finding("processors", "note", said, ("busy: runs on a wall clock will be late",))
+    return Finding("processors", "ok", said)
+
+
+def check_waking(measured: Measured) -> Finding:
+    """How late a process is woken that slept for a millisecond."""
+    late = []
+    for _ in range(SLEEPS):
+        begun_s = time.perf_counter()
+        time.sleep(SLEEP_S)
+        late.append(time.perf_counter() - begun_s - SLEEP_S)
+    measured.jitter_s = float(np.percentile(late, 99))
+    said = f"{np.median(late) * 1e6:.0f} µs late after 1 ms of sleep, at most 1 % later than {measured.jitter_s * 1e3:.2g} ms"
+    if measured.jitter_s > LATE_S:
+        return Finding("waking", "note", said, ("keep to virtual time, or to periods of 10 ms and more",))
+    return Finding("waking", "ok", said)
+
+
+def check_zenoh(measured: Measured, rounds: int = 200) -> Finding:
+    """Two sessions over the loopback, and how long a message takes from one to the other and back."""
+    back = threading.Event()
+    (endpoint,) = loopback_endpoints(1)
+    with (
+        Session(listen=[endpoint], connect=[], lockstep=False) as one,
+        Session(listen=[], connect=[endpoint], lockstep=False) as other,
+    ):
+        pong = other.publisher("doctor/pong")
+        other.subscribe("doctor/ping", pong.put)
+        one.subscribe("doctor/pong", lambda payload: back.set())
+        ping = one.publisher("doctor/ping")
+        other.declare_token("doctor/here")
+        if one.watch_tokens("doctor/*").wait(["doctor/here"], LIMIT_S / 2):
+            return Finding("Zenoh", "problem", f"no connection over {endpoint}", ("is lo up? is there a firewall?",))
+        times = []
+        for _ in range(rounds):
+            back.clear()
+            begun_s = time.perf_counter()
+            ping.put(b"doctor" * 10)
+            if not back.wait(LIMIT_S / 4):
+                return Finding("Zenoh", "problem", f"messages are lost over {endpoint}")
+            times.append(time.perf_counter() - begun_s)
+    measured.round_trip_s = float(np.median(times))
+    return Finding("Zenoh", "ok", f"sessions over {endpoint}, {measured.round_trip_s * 1e6:.0f} µs there and back")
+
+
+def check_buffers(core: Path = Path("/proc/sys/net/core")) -> Finding:
+    """How large a burst a socket may hold for who is waiting for a processor."""
+    try:
+        most, usual = (int((core / name).read_text()) for name in ("rmem_max", "rmem_default"))
+    except (OSError, ValueError) as error:
+        return Finding("socket buffers", "note", f"not known: {error}")
+    said = f"receive at most {most >> 10} KiB, candump has {usual >> 10} KiB unless it asks (-r)"
+    if most < BUFFER:
+        advice = (
+            f"against lost frames in bursts: sudo sysctl -w net.core.rmem_max={BUFFER} net.core.rmem_default={BUFFER}"
+        )
+        return Finding("socket buffers", "note", said, (advice,))
+    return Finding("socket buffers", "ok", said)
+
+
+def check_disk(folder: Path) -> Finding:
+    """Room for recordings."""
+    free = shutil.disk_usage(folder).free
+    said = f"{free / 1e9:.3g} GB free in {folder.resolve()}"
+    if free < SPACE:
+        return Finding("disk", "note", said, ("record elsewhere with --out, or make room",))
+    return Finding("disk", "ok", said)
+
+
+def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Finding:
+    """Whether the plan's shortest period can be kept here in real time, by the work of a few instants in this process."""
+    from echelon.sim.engines.in_process import Engine
+
+    period_s = min(robot.period_ns for robot in plan.robots) / 1e9
+    engine = Engine(plan)
+    steps = engine.instants()
+    next(steps)  # what is made once
+    begun_s, before = time.perf_counter(), sum(counts.sent for counts in engine.link_counts())
+    done = sum(1 for _ in islice(steps, instants))
+    spent_s = time.perf_counter() - begun_s
+    messages = sum(counts.sent for counts in engine.link_counts()) - before
+    cores = len(os.sched_getaffinity(0))
+    share = (spent_s + HANDLING * measured.round_trip_s * messages) / max(done, 1) / period_s / cores
+    said = f"period {period_s * 1e3:g} ms: about {100 * share:.0f} % of {cores} processors, for {len(plan.all_roles)} processes"
+    advice = []
+    if share > BUSY:
+        advice.append("too much for real time: longer periods, fewer robots, or --clock virtual")
+    if measured.jitter_s > period_s / 2:
+        advice.append(
+            f"woken up to {measured.jitter_s * 1e3:.2g} ms late: periods over {2e3 * measured.jitter_s:.2g} ms"
+        )
+    return Finding("wall clock", "note" if advice else "ok", said, tuple(advice))

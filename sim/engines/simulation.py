@@ -1,0 +1,150 @@
+"""A run in one process, step by step, for those who want to look at it, or to meddle with it, in between."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from echelon.errors import UserError
+from echelon.plan.layout import acceleration_of
+from echelon.messages import STATE_FIELDS, Channel, Heard, Message
+from echelon.plan.plan import NodePlan
+from echelon.sim.engines.in_process import Engine, Row
+from echelon.sim.notebook import AnyScenario, load
+from echelon.sim.results.block_series import block_series
+from echelon.sim.results.records import RunFacts
+from echelon.sim.results.run import Records, Run
+from echelon.sim.results.summary import summarise
+from echelon.sim.results.trace import Array, TraceBuilder
+from echelon.runtime.turns import Turn
+
+_STATE: Final = np.dtype([("robot", "U64"), *((name, "f8") for name in STATE_FIELDS)])
+
+
+class Simulation:
+    """A run in one process that moves when it is told to.
+
+        simulation = echelon.Simulation("lab")
+        while not simulation.done:
+            simulation.commands[0] = 0.1, 0.0        # instead of what its leader wants
+            simulation.step()
+
+    Between two steps it stands at an instant `t` at which robots have said their states and leaders have said what
+    accelerations they want, and no robot has acted on them yet.  What `commands` holds then is what the robots do.
+
+    Raises UserError for a scenario or changes that are wrong (`echelon.planning.loading`).
+    """
+
+    def __init__(self, scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> None:
+        self.plan = load(scenario, changes).plan
+        self.reset()
+
+    def reset(self) -> None:
+        """Goes back to run time 0; where the torque path is closed, drives have been brought up by then."""
+        self._trace = TraceBuilder(self.plan)
+        self._last: dict[int, Array] = {}
+        self._engine = Engine(self.plan, self._note)
+        self._time_ns = self._engine.first_ns
+        self._heard: dict[int, Heard] = {}
+        self.done = False
+        """True when the scenario's duration is over"""
+        self.commands: Array = np.full((len(self.plan.robots), 2), np.nan)
+        """Accelerations (x, y) that the robots are about to act on, (robots, 2) [m/s²], NaN: none.  Write into it as you like.
+        A robot whose period does not begin at this instant acts on what its leader says when the next one does"""
+        self._moves = self._run()
+        next(self._moves)
+
+    @property
+    def t(self) -> float:
+        """Run time [s]."""
+        return self._time_ns / 1e9
+
+    @property
+    def states(self) -> Records:
+        """What the robots last said, one record each: `robot` and the fields of `echelon.messages.STATE_FIELDS`."""
+        table = np.zeros(len(self.plan.robots), dtype=_STATE)
+        table["robot"] = [robot.name for robot in self.plan.robots]
+        for index, values in self._last.items():
+            for number, name in enumerate(STATE_FIELDS):
+                table[name][index] = values[number]
+        return table
+
+    def step(self) -> float:
+        """Lets the robots act and moves on to the next instant; returns its run time [s].
+
+        Raises UserError when the run is over (`done`)."""
+        if self.done:
+            raise UserError(f"the simulation is over at {self.t:g} s; reset() begins anew")
+        next(self._moves)
+        return self.t
+
+    def run_until(self, t: float) -> float:
+        """Steps until run time `t` [s] or the end, whichever comes first; returns the run time [s]."""
+        while not self.done and self.t < t:
+            self.step()
+        return self.t
+
+    def result(self) -> Run:
+        """Returns the run so far, as `echelon.run` does; it has no folder."""
+        trace = self._trace.build()
+        facts = RunFacts("inprocess", "virtual", 0.0, 0.0, None, None, self._engine.messages, None)
+        return Run(trace, summarise(trace, self._engine.link_counts(), None, facts))
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """|e| of every block in the robots' last states [m]."""
+        builder = TraceBuilder(self.plan)
+        for index, values in sorted(self._last.items()):
+            builder.add(Message(Channel.STATE, index, 0, self._time_ns, values))
+        return {series.block.name: float(series.norm[-1]) for series in block_series(builder.build()).series}
+
+    def _note(self, message: Message) -> None:
+        if message.channel is Channel.STATE:
+            self._last[message.source] = message.values
+        self._trace.add(message)
+
+    def _run(self) -> Iterator[None]:
+        """Runs the whole plan; pauses at each instant from 0 on before robots act."""
+        engine = self._engine
+        before = [row for row in engine.timetable if row.turn.value < Turn.ACT.value]
+        after = [row for row in engine.timetable if row.turn.value >= Turn.ACT.value]
+        for time_ns in range(engine.first_ns, self.plan.duration_ns + 1, engine.tick_ns):
+            self._time_ns = time_ns
+            self._take_turns(before, time_ns)
+            if time_ns >= 0:
+                self._hear(time_ns)
+                self.done = time_ns == self.plan.duration_ns
+                yield
+            self._take_turns(after, time_ns)
+
+    def _take_turns(self, rows: Sequence[Row], time_ns: int) -> None:
+        for row in rows:
+            if row.is_due(time_ns):
+                for role, number, run, mailbox in row.stages:
+                    hears = self._meddled(role, time_ns) if row.turn is Turn.ACT else mailbox.take(number, time_ns)
+                    for message in run(time_ns, hears):
+                        self._engine.post(message)
+
+    def _hear(self, time_ns: int) -> None:
+        """Takes what robots that act at this instant hear, so that it can be read and overwritten."""
+        for row in self._engine.timetable:
+            if row.turn is Turn.ACT and row.is_due(time_ns):
+                for role, number, _, mailbox in row.stages:
+                    (command,) = mailbox.take(number, time_ns)
+                    self._heard[role] = command
+                    self.commands[role] = (
+                        np.nan if command is None else command.values[acceleration_of(self.plan.robots[role])]
+                    )
+
+    def _meddled(self, robot: int, time_ns: int) -> list[Heard]:
+        """Returns what a robot hears, with the acceleration that `commands` holds for it."""
+        plan, command, wanted = self.plan.robots[robot], self._heard.get(robot), self.commands[robot]
+        if not np.isfinite(wanted).all():
+            return [None]
+        if command is None:  # nothing was said, or it was too old: somebody else speaks in the leader's place
+            node = self.plan.formation[plan.parent]
+            assert isinstance(node, NodePlan)
+            command = Message(Channel.COMMAND, node.index, -1, time_ns, np.zeros(2 * len(node.children)))
+        values = command.values.copy()
+        values[acceleration_of(plan)] = wanted
+        return [command._replace(values=values)]

@@ -1,0 +1,1 @@
+"""Parts of a run that others wrote: found, tried, kept."""

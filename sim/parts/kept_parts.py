@@ -1,0 +1,61 @@
+"""The parts that others wrote, kept in a run's folder: its scenario.toml runs again there, wherever they came from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from echelon.scenario.part_fields import parts_in
+from echelon.plugins import Source
+from echelon.scenario.tables import Scenario
+from echelon.sim.results.records import PartResult
+
+
+@dataclass(frozen=True, slots=True)
+class KeptParts:
+    """What is kept of a scenario's parts."""
+
+    names: dict[Source, str]
+    """What each file is called in the folder"""
+    results: tuple[PartResult, ...]
+    """The parts that are not built in, for the summary"""
+
+    @property
+    def files(self) -> dict[str, str]:
+        """The texts of the files by their names in the folder."""
+        return {name: source.text for source, name in self.names.items()}
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """The hashes of the files, for the recording."""
+        return {f"sha256 of {name}": source.sha256 for source, name in self.names.items()}
+
+
+def keep_parts(scenario: Scenario, folder: Path) -> KeptParts:
+    """Copies the files of a scenario's parts into a folder; returns what they are called there.  Raises OSError.
+
+    A file keeps its name unless another part's file, or another file that is there already, has it: nothing is overwritten."""
+    names: dict[Source, str] = {}
+    results: dict[str, PartResult] = {}
+    for part in parts_in(scenario):
+        if part.source is not None:
+            if part.source not in names:
+                names[part.source] = _copied(part.source, folder, set(names.values()))
+            name, use = names[part.source], part.use.rpartition(":")[2]
+            results[f"{name}:{use}"] = PartResult(f"{name}:{use}", name, part.source.sha256)
+        elif not part.is_own:
+            results[part.use] = PartResult(part.use, None, None)
+    return KeptParts(names, tuple(results.values()))
+
+
+def _copied(source: Source, folder: Path, taken: set[str]) -> str:
+    """Puts a file into a folder; returns what it is called there."""
+    data, path = source.text.encode(), Path(source.name)
+    count = 1
+    while True:
+        target = folder / (path.name if count == 1 else f"{path.stem}-{count}{path.suffix}")
+        if target.name not in taken:
+            if not target.exists():
+                target.write_bytes(data)
+                return target.name
+            if target.is_file() and target.read_bytes() == data:
+                return target.name
+        count += 1

@@ -1,0 +1,93 @@
+"""Tries the parts of a plan that others wrote before a run begins: what fails at once is a mistake in the scenario.
+
+Each is asked as a run will ask it: a trajectory at instants of the run, a law for each block with the errors at the start and
+with none, a plant for each robot at rest and moving.  What they answer is checked as in a run.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from echelon.agents.plant import make_step, state_at
+from echelon.controller.laws.law import Block, law_block, make_nu, make_state, make_weight
+from echelon.controller.trajectory import make_trajectory
+from echelon.controller.transformation import Transformation
+from echelon.errors import PartRunError
+from echelon.plan.plan import Array, Plan, RobotPlan
+from echelon.plugins import Part
+from echelon.sim.parts.time_limit import TookTooLong, time_limit
+
+PATIENCE_S: Final = 2.0
+"""For one question"""
+INSTANTS: Final = 100
+"""At which a trajectory is asked, spread over the run, as many as there are in `INSTANTS_S` [s]"""
+INSTANTS_S: Final = 0.5
+_T = TypeVar("_T")
+
+
+def probe(plan: Plan) -> None:
+    """Tries the parts of a plan that are not built in.
+
+    Raises PartRunError, whose text names file and class, if one raises, gives no answer of the right shape, or takes longer
+    than `PATIENCE_S`."""
+    if not plan.trajectory.is_own:
+        _probe_trajectory(plan)
+    if not plan.law.is_own:
+        _probe_law(plan)
+    for robot in plan.robots:
+        if not robot.model.is_own:
+            _probe_plant(robot)
+
+
+def _asked(who: str, ask: Callable[[], _T]) -> _T:
+    try:
+        with time_limit(PATIENCE_S):
+            return ask()
+    except TookTooLong:
+        raise PartRunError(f"{who} takes longer than {PATIENCE_S:g} s") from None
+
+
+def _probe_trajectory(plan: Plan) -> None:
+    trajectory = make_trajectory(plan.trajectory)
+    end_s, begun_s = plan.duration_ns / 1e9, time.monotonic()
+    for number, t in enumerate([0.0, end_s, *np.linspace(0.0, end_s, INSTANTS).tolist()]):
+        if number > 1 and time.monotonic() - begun_s > INSTANTS_S:
+            break
+        _asked(f"{plan.trajectory.use}: at({t:g})", partial(trajectory.at, t))
+
+
+def _probe_law(plan: Plan) -> None:
+    cbt = Transformation(plan)
+    z_cd = make_trajectory(plan.trajectory).at(0.0)
+    errors = (cbt.forward(np.array([robot.start for robot in plan.robots])) - cbt.desired(z_cd[0])).ravel()
+    rates, feed_forward = np.zeros((2, len(errors)))
+    rates[-2:], feed_forward[-2:] = -z_cd[1], z_cd[2]
+    for given in (errors, rates, feed_forward):
+        given.flags.writeable = False
+    for block in plan.blocks:
+        if block.size:
+            rows = slice(block.offset, block.offset + block.size)
+            ask = partial(_ask_law, plan.law, law_block(plan, block), errors[rows], rates[rows], feed_forward[rows])
+            _asked(f"{plan.law.use} of block {block.name}: nu", ask)
+
+
+def _ask_law(law: Part[Any], block: Block, e: Array, e_dot: Array, feed_forward: Array) -> None:
+    nu, state = make_nu(law, block), make_state(law, block)
+    make_weight(law, block)
+    nu(0.0, e, e_dot, feed_forward, state)
+    nothing = np.zeros(block.size)
+    nothing.flags.writeable = False
+    nu(block.period_s, nothing, nothing, feed_forward, state)
+
+
+def _probe_plant(robot: RobotPlan) -> None:
+    h = robot.torque_period_ns * 1e-9
+    who = f"{robot.model.use} of {robot.name}"
+    step = _asked(f"{who}: step_of", partial(make_step, robot))
+    torque = 0.1 * robot.mass * robot.wheel_radius  # for 0.2 m/s²
+    for v, omega in ((0.0, 0.0), (0.3, -0.2)):
+        state = state_at(*robot.start, robot.heading, v, omega)
+        _asked(f"{who}: step", partial(step, state, torque, torque / 2, h))

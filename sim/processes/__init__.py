@@ -1,0 +1,1 @@
+"""A run as processes: brought up, watched over, taken down."""

@@ -1,0 +1,243 @@
+"""The processes of a run as their supervisor sees them: who they are and whom they talk to, how they start, what they
+say, how they ended."""
+
+import os
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from echelon.plan.plan import Plan, RobotPlan
+from echelon.runtime.session import loopback_endpoints
+from echelon.sim.processes.contract import ProcessSpec
+from echelon.sim.parts.foreign_parts import runs_text
+from echelon.sim.processes.process import main
+from echelon.sim.processes.to_supervisor import Done
+
+PRELOAD: Final = ["echelon.sim.processes.process"]
+ENVIRONMENT: Final = {"PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""For the processes of a run.  A formation's matrices are small: threads of numpy's would only wait for each other"""
+LAST_WORDS: Final = 4000
+"""Bytes kept of what a process says on standard error."""
+ROLES: Final = ("robot", "leader", "coordinator")
+"""Kinds of processes that run parts which others may write"""
+FINISHING: Final = ("bridge", "drives", "referee", "recorder")
+"""Processes that are told when to finish, in the order in which they are; bridge and drives keep step with the run by
+themselves where the torque path is closed and time is virtual."""
+
+
+@dataclass(slots=True)
+class Child:
+    """A started process, with the ends of its pipes and what it has said so far."""
+
+    spec: ProcessSpec
+    process: ForkServerProcess
+    control: Connection
+    words: Connection
+    """Its standard output and standard error"""
+    heard_s: float
+    ready: bool = False
+    done: Done | None = None
+    waiting_for: list[int] = field(default_factory=list)
+    waiting_ns: int = -1
+    said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
+
+    @property
+    def name(self) -> str:
+        """Its name in the run."""
+        return self.spec.name
+
+    @property
+    def is_member(self) -> bool:
+        """True for those who are done when the run is; False for those who are told when to finish."""
+        return self.spec.member
+
+    def hear_words(self) -> None:
+        """Takes all that it has said on standard error and not been heard yet."""
+        try:
+            while data := os.read(self.words.fileno(), 65536):
+                self.said.append(data)
+        except BlockingIOError:
+            return
+        self.words.close()
+
+    def last_words(self) -> str:
+        """Returns the end of what it said on standard error."""
+        return b"".join(self.said)[-LAST_WORDS:].decode(errors="replace").strip()
+
+    def ending(self) -> str:
+        """Says how it ended."""
+        code = self.process.exitcode
+        if code is None:
+            return "does not answer"
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    def runs(self) -> str:
+        """Says which parts that others wrote it runs; nothing if there are none."""
+        return runs_text(self.spec.plan, self.spec.index) if self.spec.kind in ROLES else ""
+
+    def state(self) -> str:
+        """Returns what the kernel says of it: running, sleeping, stopped…"""
+        try:
+            text = Path(f"/proc/{self.process.pid}/status").read_text()
+        except OSError:
+            return "gone"
+        state = next((line for line in text.splitlines() if line.startswith("State:")), "State: ? (unknown)")
+        return state.partition("(")[2].rstrip(")")
+
+
+def warm_up() -> None:
+    """Starts the fork server, which imports in the background what processes need.  Call it early."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(PRELOAD)
+    from multiprocessing import forkserver, resource_tracker
+
+    with _on_its_own():
+        resource_tracker.ensure_running()  # which changes the mask when it starts
+    # Ctrl-C reaches the whole terminal: it is for this process alone, and not for one that is just importing.
+    unmasked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with _on_its_own():
+            forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, unmasked)
+
+
+@contextmanager
+def _on_its_own() -> Iterator[None]:
+    """Starts processes that see no module of the working folder (a user's `numpy.py` there is not numpy), and that do not
+    run the calling script again: it needs no `if __name__ == "__main__":`, and may come from standard input."""
+    script, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ENVIRONMENT}
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ |= ENVIRONMENT
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def start(spec: ProcessSpec) -> Child:
+    """Starts a process of a run."""
+    context: ForkServerContext = get_context("forkserver")
+    context.set_forkserver_preload(PRELOAD)
+    control, child_control = context.Pipe()
+    words, child_words = context.Pipe(duplex=False)
+    process = context.Process(target=main, args=(spec, child_control, child_words), name=spec.name, daemon=True)
+    with _on_its_own():
+        process.start()
+    child_control.close()
+    child_words.close()
+    os.set_blocking(words.fileno(), False)
+    return Child(spec, process, control, words, time.monotonic())
+
+
+def list_specs(
+    plan: Plan,
+    run: str,
+    virtual: bool,
+    folder: Path,
+    can_urls: tuple[str, ...],
+    scenario_toml: str,
+    metadata: dict[str, str],
+    part_files: dict[str, str],
+    recorded: bool,
+) -> list[ProcessSpec]:
+    """Lists the processes of a run and who connects to whom.
+
+    Every node listens and its children connect; so does the recorder, to whom everyone connects.  To bridge and drives
+    robots connect, and the bridge to the drives.
+    """
+    stations = [role.name for role in plan.bus_roles]
+    if can_urls and not plan.can.closed:
+        stations = ["bridge"]
+    hubs = (["recorder"] if recorded else []) + stations
+    endpoints = loopback_endpoints(len(plan.nodes) + len(hubs))
+    at = {node.index: endpoints.pop() for node in plan.nodes}
+    hub_at = {hub: endpoints.pop() for hub in hubs}
+    recorder = ["recorder"] if recorded else []
+    common: dict[str, Any] = {
+        "run": run,
+        "plan": plan,
+        "virtual": virtual,
+        "folder": str(folder),
+        "can_urls": can_urls,
+        "scenario_toml": scenario_toml,
+        "metadata": metadata,
+        "part_files": part_files,
+    }
+
+    def with_hubs(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+        return tuple(hub_at[name] for name in names), tuple((name, name) for name in names)
+
+    specs = []
+    for member in plan.formation:
+        near = [] if member.parent is None else [member.parent]
+        near += [] if isinstance(member, RobotPlan) else member.children
+        endpoints_of, peers_of = with_hubs(recorder + (stations if isinstance(member, RobotPlan) else []))
+        specs.append(
+            ProcessSpec(
+                kind=member.role,
+                name=member.name,
+                index=member.index,
+                listen=(at[member.index],) if member.index in at else (),
+                connect=(*(() if member.parent is None else (at[member.parent],)), *endpoints_of),
+                peers=(*((plan.formation[peer].role, plan.formation[peer].name) for peer in near), *peers_of),
+                watched=recorded or (bool(stations) and isinstance(member, RobotPlan) and not plan.can.closed),
+                **common,
+            )
+        )
+    robots = tuple((robot.role, robot.name) for robot in plan.robots)
+    for number, station in enumerate(stations):
+        later = stations[number + 1 :]
+        endpoints_of, _ = with_hubs(recorder + later)
+        others = tuple((name, name) for name in recorder + stations if name != station)
+        specs.append(
+            ProcessSpec(
+                kind=station,
+                name=station,
+                index=len(plan.formation) + number,
+                listen=(hub_at[station],),
+                connect=endpoints_of,
+                peers=(*robots, *others),
+                watched=recorded,
+                member=virtual and plan.can.closed,
+                **common,
+            )
+        )
+    if recorded:
+        everyone = tuple((member.role, member.name) for member in plan.formation)
+        specs.append(
+            ProcessSpec(
+                kind="recorder",
+                name="recorder",
+                index=len(plan.formation) + len(stations),
+                listen=(hub_at["recorder"],),
+                connect=(),
+                peers=(*everyone, *((name, name) for name in stations)),
+                member=False,
+                **common,
+            )
+        )
+    if not virtual and any(url.startswith("socketcan") for url in can_urls):
+        # Elsewhere it would cost too much to hear every frame once more: there can.log is judged afterwards.
+        specs.append(
+            ProcessSpec(
+                kind="referee", name="referee", index=-1, listen=(), connect=(), peers=(), member=False, **common
+            )
+        )
+    # Those that import most start first.
+    return sorted(specs, key=lambda spec: spec.kind not in FINISHING)

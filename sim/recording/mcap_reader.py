@@ -1,0 +1,278 @@
+"""Reading a recording, whole or cut short, and mending one that was cut.
+
+A file is read record by record from its start, so that what a killed recorder left is worth as much as a finished file.
+Whatever is wrong with a file's content is a ValueError with one line that begins with its path.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from os import SEEK_END, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from echelon.runtime.link import LinkCounts
+from echelon.messages import STATE_FIELDS, TORQUE_FIELDS
+from echelon.messages import Channel as MessageChannel
+from echelon.plan.plan import Plan
+from echelon.sim.recording.mcap_reader import ros
+from echelon.sim.recording.mcap_writer import CHUNK_SIZE, MAGIC, METADATA
+from echelon.sim.recording.recorder import LINKS, SCENARIO, state_topic, torque_topic
+from echelon.sim.results.trace import Trace
+
+_RECORD: Final = struct.Struct("<BQ")
+_MESSAGE: Final = struct.Struct("<HIQQ")
+_LINK: Final = struct.Struct("<IIB")
+_COUNTS: Final = struct.Struct("<6Qdq")
+_READERS: Final = {
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.SCHEMA: Schema.read,
+}
+
+
+class CutError(ValueError):
+    """A recording that ends before its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecoverResult:
+    """What was saved: messages, up to which run time [ns] (None if there are none), and how many damaged pieces were
+    left out; `complete` is True if nothing was missing."""
+
+    messages: int
+    until_ns: int | None
+    damaged: int
+    complete: bool
+
+
+def read_trace(path: Path, plan: Plan) -> Trace:
+    """Returns the robots' states, bit for bit as they were recorded.
+
+    Raises ValueError if the file is cut, damaged, no recording, or none of this plan."""
+    topics = [state_topic(robot.path) for robot in plan.robots]
+    with _blame(path):
+        times_ns, states = _by_robot(path, topics, "RobotState", ros.robot_state(), len(STATE_FIELDS))
+        return Trace(plan, times_ns, states)
+
+
+def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Returns what the robots of a closed torque path wanted of their wheels: of each robot its instants [ns], (T,), and what
+    it said, (T, len(TORQUE_FIELDS)).
+
+    Raises ValueError if the file is cut, damaged, no recording, or none of this plan."""
+    topics = [torque_topic(robot.path) for robot in plan.robots]
+    with _blame(path):
+        times_ns, torques = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), len(TORQUE_FIELDS))
+        return list(zip(times_ns, torques, strict=True))
+
+
+def _by_robot(
+    path: Path, topics: Sequence[str], kind: str, splice: ros.Splice, width: int
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.float64], ...]]:
+    """Returns the times [ns] and the values, `width` numbers each, of the messages of topics, one topic for each robot."""
+    robots = {topic: robot for robot, topic in enumerate(topics)}
+    prefix = len(splice.encode(ros.stamp(0), b""))
+    times: list[list[int]] = [[] for _ in topics]
+    values: list[list[bytes]] = [[] for _ in topics]
+    for topic, time_ns, data in _messages(path, robots, f"echelon_msgs/{kind}"):
+        if len(data) != prefix + 8 * width:
+            raise ValueError(f"a {kind} of {topic} has {len(data)} bytes, not {prefix + 8 * width}")
+        robot = robots[topic]
+        times[robot].append(time_ns)
+        values[robot].append(data[prefix:])
+    return (
+        tuple(np.array(row, np.int64) for row in times),
+        tuple(np.frombuffer(b"".join(row), "<f8").reshape(-1, width) for row in values),
+    )
+
+
+def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
+    """Returns the counts of links with the run time [ns] they were taken at, in the order of the recording.
+
+    Raises ValueError if the file is cut, damaged or no recording."""
+    found = []
+    with _blame(path):
+        for _, time_ns, data in _messages(path, {LINKS}, "echelon_msgs/LinkStatistics"):
+            at = len(ros.stamp(0)) + 8  # the empty frame_id
+            source, receiver, channel = _LINK.unpack_from(data, at)
+            counts = _COUNTS.unpack(data[-_COUNTS.size :])
+            found.append((time_ns, LinkCounts(source, receiver, MessageChannel(channel), *counts)))
+    return found
+
+
+def read_scenario(path: Path) -> str:
+    """Returns the effective scenario, TOML.  A cut file will do.  Raises ValueError if there is none."""
+    with _blame(path):
+        for record in _records(path):
+            if isinstance(record, Attachment) and record.name == SCENARIO:
+                return record.data.decode()
+        raise ValueError(f"holds no {SCENARIO}")
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Returns the metadata given to the recorder.  A cut file will do.  Raises ValueError if there is none."""
+    with _blame(path):
+        for record in _records(path):
+            if isinstance(record, Metadata) and record.name == METADATA:
+                return record.metadata
+        raise ValueError("holds no metadata of a run")
+
+
+def is_finished(path: Path) -> bool:
+    """Returns True if a file ends as a finished one does: behind its messages there is a summary for those who seek in it."""
+    with path.open("rb") as file:
+        file.seek(-min(len(MAGIC), path.stat().st_size), SEEK_END)
+        return file.read() == MAGIC
+
+
+def recover(source: Path, target: Path) -> RecoverResult:
+    """Writes what is whole in `source` to `target`, with attachments and metadata, as a complete file.
+
+    `target` appears only when it is done.  Raises ValueError if `source` is no MCAP file, or is `target`, and OSError if
+    `target` cannot be written."""
+    partial = target.with_name(target.name + ".part")
+    with _blame(source):
+        if target.exists() and target.samefile(source):
+            raise ValueError("cannot be mended in place; give another file to write to")
+        try:
+            with partial.open("wb") as file:
+                result = _copy(source, Writer(file, CHUNK_SIZE, CompressionType.ZSTD))
+            replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+    return result
+
+
+def _copy(source: Path, writer: Writer) -> RecoverResult:
+    schemas, channels = {0: 0}, dict[int, int]()
+    messages, until_ns, damaged, complete = 0, None, list[str](), True
+    writer.start("ros2", "echelon")
+    try:
+        for record in _records(source, damaged):
+            if isinstance(record, Schema) and record.id not in schemas:
+                schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+            elif isinstance(record, Channel) and record.id not in channels and record.schema_id in schemas:
+                channels[record.id] = writer.register_channel(
+                    record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                )
+            elif isinstance(record, Message) and record.channel_id in channels:
+                channel = channels[record.channel_id]
+                writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+                messages, until_ns = messages + 1, max(until_ns or 0, record.log_time)
+            elif isinstance(record, Attachment):
+                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+            elif isinstance(record, Metadata):
+                writer.add_metadata(record.name, record.metadata)
+    except CutError:
+        complete = False
+    writer.finish()  # type: ignore[no-untyped-call]
+    return RecoverResult(messages, until_ns, len(damaged), complete and not damaged)
+
+
+def _messages(path: Path, topics: "dict[str, int] | set[str]", kind: str) -> Iterator[tuple[str, int, bytes]]:
+    """Yields topic, time and bytes of the messages of some topics, all of one type of ours."""
+    schemas, wanted = dict[int, Schema](), dict[int, str]()
+    for record in _records(path):
+        if isinstance(record, Message):
+            if record.channel_id in wanted:
+                yield wanted[record.channel_id], record.log_time, record.data
+        elif isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel) and record.topic in topics:
+            schema = schemas.get(record.schema_id)
+            if schema is None or schema.name != ros.schema_name(kind) or schema.data != ros.schema_text(kind).encode():
+                raise ValueError(f"{record.topic} is not of the {ros.schema_name(kind)} known here")
+            wanted[record.id] = record.topic
+    if not wanted:
+        raise ValueError(f"holds no {ros.schema_name(kind)} of this plan")
+
+
+def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:
+    """Yields schemas, channels, messages, attachments and metadata in the order of the file.
+
+    What is damaged raises ValueError, or is left out and noted in `damaged`.  Raises CutError where the file ends
+    before its end."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ValueError("is no MCAP file")
+        while len(head := file.read(_RECORD.size)) == _RECORD.size:
+            opcode, length = _RECORD.unpack(head)
+            if opcode == Opcode.DATA_END:
+                return
+            if length > size - file.tell():
+                break
+            reader = _READERS.get(opcode)
+            try:
+                if opcode == Opcode.MESSAGE:
+                    yield _message(file.read(length))
+                elif reader is None:
+                    file.seek(length, 1)
+                else:
+                    yield from _unpacked(opcode, file.read(length))
+            except ValueError as error:
+                if damaged is None:
+                    raise
+                damaged.append(str(error))
+    raise CutError("is cut short; mend it with `echelon recover`")
+
+
+def _unpacked(opcode: int, body: bytes) -> list[McapRecord]:
+    """Returns a record, or those in it if it is a chunk.  Raises ValueError if it is damaged."""
+    try:
+        if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]) != struct.unpack("<I", body[-4:])[0] != 0:
+            raise ValueError("checksum")
+        record = _READERS[Opcode(opcode)](ReadDataStream(BytesIO(body)))
+        if not isinstance(record, Chunk):
+            return [record]
+        stream, length = get_chunk_data_stream(record, validate_crc=True)
+        data = stream.read(length)
+    except Exception as error:  # whatever a parser makes of bytes that are not what they say they are
+        raise ValueError(f"is damaged: a {Opcode(opcode).name.lower()} cannot be read") from error
+    records, at = list[McapRecord](), 0
+    while at < len(data):
+        if at + _RECORD.size > len(data):
+            raise ValueError("is damaged: a chunk ends within a record")
+        inner, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > len(data):
+            raise ValueError("is damaged: a chunk ends within a record")
+        inner_body = data[at : at + length]
+        if inner == Opcode.MESSAGE:
+            records.append(_message(inner_body))
+        elif inner in (Opcode.SCHEMA, Opcode.CHANNEL):
+            records.extend(_unpacked(inner, inner_body))
+        at += length
+    return records
+
+
+def _message(body: bytes) -> Message:
+    if len(body) < _MESSAGE.size:
+        raise ValueError("is damaged: a message is too short")
+    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
+    return Message(channel, log_time, body[_MESSAGE.size :], publish_time, sequence)
+
+
+@contextmanager
+def _blame(path: Path) -> Iterator[None]:
+    """Puts a file's path before what is wrong with it, on one line."""
+    try:
+        yield
+    except CutError as error:
+        raise CutError(f"{path}: {error}") from error
+    except (ValueError, struct.error) as error:
+        raise ValueError(" ".join(f"{path}: {error}".split())) from error

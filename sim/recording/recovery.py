@@ -1,0 +1,189 @@
+"""Rebuilds the folder of a run that was killed: the recording, the summary, the report, from what had been written.
+
+What nobody wrote down is absent: wall time, counts of links, what became of frames besides those in can.log.
+"""
+
+import fcntl
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from echelon.bridge.timing.bus_load import BitCount
+from echelon.bridge.timing.buses import scheduled
+from echelon.bridge.timing.fit import plan_fit
+from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
+from echelon.bridge.referee.referee import read_run_log
+from echelon.bridge.reports import BusReport, CanReport
+from echelon.errors import UserError
+from echelon.plan.plan import Plan
+from echelon.shipped import EFFECTIVE
+from echelon.sim.parts.loading import load
+from echelon.sim.recording.mcap_reader import (
+    RecoverResult,
+    is_finished,
+    read_links,
+    read_metadata,
+    read_scenario,
+    read_trace,
+    recover,
+)
+from echelon.sim.results.records import RunFacts
+from echelon.sim.results.rendering import read_summary, write_summary
+from echelon.sim.results.summary import summarise
+from echelon.sim.results.trace import Trace
+from echelon.sim.run import CUT, judged
+from echelon.sim.run_folder import report_on
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What became of a run's folder: the files that were written, none if it was whole; why there is no report, if so."""
+
+    recording: RecoverResult
+    files: tuple[str, ...]
+    report_failure: str = ""
+
+
+def recover_run(folder: Path) -> Recovered:
+    """Mends `run.mcap`, keeping the one that was cut as `run.mcap.cut`, and writes the summary and the report anew.
+
+    The summary's verdict fails, for the run broke off.  A folder that is whole stays as it is.  Raises UserError where nothing
+    was recorded, or the run still goes on, and OSError."""
+    recording, cut = folder / "run.mcap", folder / CUT
+    if cut.exists() and not recording.exists():  # killed while it was mended
+        os.replace(cut, recording)
+    try:
+        _check_done(recording)
+        mended = folder / "run.mcap.mended"
+        result = recover(recording, mended)
+        files: list[str] = []
+        if result.complete and is_finished(recording):
+            mended.unlink()
+        else:
+            os.replace(recording, cut)
+            os.replace(mended, recording)
+            files += ["run.mcap", CUT]
+        if result.complete and _has_summary(folder):
+            return Recovered(result, tuple(files))
+        files += _rebuild(folder, recording, result)
+    except FileNotFoundError as error:
+        raise UserError(f"{error.filename}: there is none: nothing of a run can be rebuilt without it") from None
+    except ValueError as error:  # which begins with the file
+        raise UserError(str(error)) from None
+    failure = ""
+    try:
+        report_on([folder], folder / "report.html")
+        files.append("report.html")
+    except (UserError, OSError) as error:  # of a run that was killed early there may be nothing to report
+        failure = f"no report: {error}"
+    return Recovered(result, tuple(files), failure)
+
+
+def _check_done(recording: Path) -> None:
+    """Raises UserError while a recorder is writing the file."""
+    with recording.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"{recording}: is being written: the run goes on") from None
+        except OSError:  # a file system without locks
+            pass
+
+
+def _has_summary(folder: Path) -> bool:
+    with suppress(OSError, ValueError):
+        read_summary(folder / "summary.json")
+        return True
+    return False
+
+
+def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
+    """Writes what a run's folder lacks, except for the report; returns the names of the files."""
+    files: list[str] = []
+    scenario = folder / EFFECTIVE
+    if not scenario.exists() or not scenario.stat().st_size:
+        scenario.write_text(read_scenario(recording), encoding="utf-8")
+        files.append(EFFECTIVE)
+    _, plan = load(scenario)
+    metadata = read_metadata(recording)
+    trace = read_trace(recording, plan)
+    links = [counts for _, counts in read_links(recording)]
+    facts = RunFacts(
+        engine=metadata.get("engine", ""),
+        clock=metadata.get("clock", ""),
+        wall_time=None,
+        startup_time=None,
+        real_time_factor=None,
+        ticks_per_second=None,
+        messages=None,
+        failure=_failure(trace, result, bool(links)),
+        version=metadata.get("echelon", ""),
+        python=metadata.get("python", ""),
+    )
+    log, can = folder / "can.log", None
+    if log.exists():
+        _drop_cut_line(log)
+        can = _report_of_log(plan, log, facts.clock)
+        for bus, name in enumerate(dbc_names(plan)):
+            if not (folder / name).exists():
+                (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
+                files.append(name)
+    write_summary(summarise(trace, links, can, facts), folder / "summary.json")
+    return [*files, "summary.json"]
+
+
+def _failure(trace: Trace, result: RecoverResult, counted: bool) -> str:
+    """Returns why the run broke off, as far as can be told afterwards."""
+    until_ns = max((int(times_ns[-1]) for times_ns in trace.times_ns if len(times_ns)), default=None)
+    if until_ns is None:
+        return "broken off: no state of a robot was recorded"
+    links = "" if counted else "; counts of links were not recorded"
+    if result.complete:
+        return f"broken off before its summary was written; this one is rebuilt from the recording{links}"
+    until = f"the recording ends at {until_ns / 1e9:g} s of {trace.plan.duration_ns / 1e9:g} s"
+    return f"broken off: {until}; this summary is rebuilt from it{links}"
+
+
+def _drop_cut_line(log: Path) -> None:
+    """Cuts off what follows the last whole line: half a frame may look like a shorter one."""
+    content = log.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        os.truncate(log, whole)
+
+
+def _report_of_log(plan: Plan, log: Path, clock: str) -> CanReport:
+    """Returns what can.log tells of the buses."""
+    counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, 0
+    for time_ns, bus, (can_id, data, remote) in read_run_log(log, plan):
+        counts[bus].add(can_id, data, remote)
+        frames, last_ns = frames + 1, max(last_ns, time_ns)
+    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
+    seconds = max(last_ns + start_ns, 1) / 1e9
+    buses = tuple(
+        BusReport(bus.name, bus.bitrate, count.bits / (bus.bitrate * seconds))
+        for bus, count in zip(plan.can.buses, counts, strict=True)
+    )
+    fit = plan_fit(plan)
+    return CanReport(
+        path=plan.can.path,
+        timing=plan.can.timing if plan.can.closed else None,
+        url="",
+        listen="",
+        torque_scale=plan.can.torque_scale,
+        log_start=-start_ns / 1e9,
+        frames=frames,
+        load_mean=max(bus.load for bus in buses),
+        fit=tuple(bus.lines[0] for bus in fit),
+        advice=tuple(way for bus in fit for way in bus.advice),
+        buses=buses,
+        scheduled=scheduled(plan),
+        sent=None,
+        failed=None,
+        dropped=None,
+        log_lost=None,
+        log_error=None,
+        robots={},
+        referee=judged(log, plan, clock, whole=False) if frames else None,
+    )

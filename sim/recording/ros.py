@@ -1,0 +1,292 @@
+"""ROS 2 messages as bytes: definitions (ros2msg) and encoders (CDR, little endian).
+
+A CDR message is four bytes of encapsulation, then its fields; a number lies at a multiple of its size, counted from
+behind the encapsulation.  What is written thousands of times a second never changes its size: its bytes are laid out
+once (`Layout`), and a message is those bytes with the stamp and the float64 values put in their places.
+"""
+
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echelon.runtime.link import LinkCounts
+from echelon.messages import GROUP_FIELDS, STATE_FIELDS, TORQUE_FIELDS
+
+Array = NDArray[np.float64]
+
+ENCAPSULATION: Final = b"\x00\x01\x00\x00"
+WORLD: Final = "world"
+"""The frame of reference in which all positions are."""
+ARROW, SPHERE, LINE_STRIP = 0, 2, 4
+
+_HEADER: Final = "std_msgs/Header header\n"
+_MARKER_KINDS: Final = (
+    *("ARROW", "CUBE", "SPHERE", "CYLINDER", "LINE_STRIP", "LINE_LIST", "CUBE_LIST", "SPHERE_LIST", "POINTS"),
+    *("TEXT_VIEW_FACING", "MESH_RESOURCE", "TRIANGLE_LIST"),
+)
+_MARKER_CONSTANTS: Final = "".join(f"int32 {name}={value}\n" for value, name in enumerate(_MARKER_KINDS))
+DEFINITIONS: Final = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec\n",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
+    "geometry_msgs/TransformStamped": _HEADER + "string child_frame_id\ngeometry_msgs/Transform transform\n",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
+    "sensor_msgs/CompressedImage": _HEADER + "string format\nuint8[] data\n",
+    "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v\n",
+    "visualization_msgs/MeshFile": "string filename\nuint8[] data\n",
+    "visualization_msgs/Marker": (
+        _MARKER_CONSTANTS + "int32 ADD=0\nint32 MODIFY=0\nint32 DELETE=2\nint32 DELETEALL=3\n" + _HEADER + "string ns\n"
+        "int32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 scale\n"
+        "std_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool frame_locked\n"
+        "geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\n"
+        "sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\nstring text\n"
+        "string mesh_resource\nvisualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials\n"
+    ),
+    "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers\n",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "nav_msgs/Odometry": _HEADER + "string child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+    "geometry_msgs/TwistWithCovariance twist\n",
+    "sensor_msgs/JointState": _HEADER + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
+    "can_msgs/Frame": _HEADER + "uint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n",
+    "echelon_msgs/RobotState": _HEADER + "".join(f"float64 {name}\n" for name in STATE_FIELDS),
+    "echelon_msgs/GroupState": _HEADER
+    + "".join(f"float64 {name}\n" for name in GROUP_FIELDS)
+    + "float64[] error_rates\nfloat64[] positions\n",
+    "echelon_msgs/Reference": _HEADER + "float64[] accelerations\nfloat64[] error_rates\nfloat64[] forces\n",
+    "echelon_msgs/Command": _HEADER + "float64[] accelerations\n",
+    "echelon_msgs/WheelTorque": _HEADER + "".join(f"float64 {name}\n" for name in TORQUE_FIELDS),
+    "echelon_msgs/Wheels": _HEADER + "float64[] torques\n",
+    "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
+    "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
+    "float64 age_mean_ns\nint64 age_max_ns\n",
+}
+"""Message definitions by name, without the middle `msg`; a definition names the types of its fields in full."""
+
+
+def ros_name(path: str) -> str:
+    """Returns a path of names as ROS allows it in topics and frames, where hyphens are not: `g-1/r2` is `g_1/r2`."""
+    return path.replace("-", "_")
+
+
+def schema_name(name: str) -> str:
+    """Returns a type's name with the middle `msg`: `nav_msgs/Odometry` is `nav_msgs/msg/Odometry`."""
+    return name.replace("/", "/msg/")
+
+
+def schema_text(name: str) -> str:
+    """Returns a definition followed by those of all types in it, as ros2msg wants it."""
+    parts, found, waiting = [DEFINITIONS[name]], {name}, [name]
+    while waiting:
+        for line in DEFINITIONS[waiting.pop(0)].splitlines():
+            used = line.split(" ")[0].partition("[")[0]
+            if used in DEFINITIONS and used not in found:
+                found.add(used)
+                waiting.append(used)
+                parts.append(f"MSG: {used}\n{DEFINITIONS[used]}")
+    return f"{'=' * 80}\n".join(parts)
+
+
+def stamp(time_ns: int) -> bytes:
+    """Returns how a message with a header begins: encapsulation and stamp, 12 bytes."""
+    return ENCAPSULATION + struct.pack("<iI", *divmod(time_ns, 1_000_000_000))
+
+
+class Layout:
+    """A message being laid out, field by field; it remembers where stamps and float64 values are to be put."""
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+        self.stamps: list[int] = []
+        self.places: list[int] = []
+
+    def put(self, code: str, *values: float) -> "Layout":
+        """Puts numbers of one type, a code of `struct`."""
+        size = struct.calcsize(f"<{code}")
+        self.body += bytes(-len(self.body) % size) + struct.pack(f"<{len(values)}{code}", *values)
+        return self
+
+    def string(self, text: str) -> "Layout":
+        """Puts a string: its length, its bytes, a zero."""
+        data = text.encode() + b"\x00"
+        self.put("I", len(data))
+        self.body += data
+        return self
+
+    def header(self, frame_id: str) -> "Layout":
+        """Puts a header; its stamp is filled in later."""
+        self.put("I", 0)
+        self.stamps.append(len(self.body) - 4)
+        return self.put("I", 0).string(frame_id)
+
+    def hole(self, count: int) -> "Layout":
+        """Leaves room for float64 values that are filled in later."""
+        self.put("d", *[0.0] * count)
+        self.places.extend(range(len(self.body) - 8 * count, len(self.body), 8))
+        return self
+
+    def holes(self, count: int) -> "Layout":
+        """The same for a sequence; an empty one is only its length, without alignment of what it does not hold."""
+        self.put("I", count)
+        return self.hole(count) if count else self
+
+
+class Template:
+    """A laid-out message into which all stamps and all float64 values are put."""
+
+    def __init__(self, layout: Layout) -> None:
+        size = 8 + len(layout.body)
+        self._bytes = np.zeros(size + -size % 8, np.uint8)  # four idle bytes, the encapsulation, the body at offset 8
+        self._bytes[4:size] = np.frombuffer(ENCAPSULATION + layout.body, np.uint8)
+        self._words, self._doubles = self._bytes.view("<u4"), self._bytes.view("<f8")
+        self._message = self._bytes[4:size]
+        self._seconds = np.array(layout.stamps, int) // 4 + 2
+        self._nanoseconds = self._seconds + 1
+        self._places = np.array(layout.places, int) // 8 + 1
+
+    def encode(self, time_ns: int, values: Array) -> bytes:
+        """Returns the message; `values` are as many as the layout has places, in its order."""
+        self._words[self._seconds], self._words[self._nanoseconds] = divmod(time_ns, 1_000_000_000)
+        self._doubles[self._places] = values
+        return self._message.tobytes()
+
+
+class Splice:
+    """A laid-out message that begins with a header and whose values come as one run of bytes, the float64 in order.
+
+    Faster than `Template`: constant bytes and pieces of the run are joined."""
+
+    def __init__(self, layout: Layout) -> None:
+        starts = [at for at in layout.places if at - 8 not in layout.places]
+        ends = [at + 8 for at in layout.places if at + 8 not in layout.places]
+        body = bytes(layout.body)
+        self.size = 8 * len(layout.places)
+        """How many bytes of values a message holds."""
+        self._first = body[8 : starts[0]]
+        self._end = ends[0] - starts[0]
+        self._rest: list[tuple[bytes, int, int]] = []
+        at = self._end
+        for end, start, next_end in zip(ends, [*starts[1:], len(body)], [*ends[1:], len(body)], strict=True):
+            if start > end:
+                self._rest.append((body[end:start], at, at + next_end - start))
+                at += next_end - start
+
+    def encode(self, head: bytes, values: bytes) -> bytes:
+        """Returns the message; `head` is from `stamp`, `values` are `size` bytes."""
+        if not self._rest:
+            return head + self._first + values
+        message = head + self._first + values[: self._end]
+        for constant, start, end in self._rest:
+            message += constant + values[start:end]
+        return message
+
+
+def robot_state() -> Splice:
+    """Returns the encoder of echelon_msgs/RobotState; its values are `STATE_FIELDS`."""
+    return Splice(Layout().header(WORLD).hole(len(STATE_FIELDS)))
+
+
+def group_state(error_rates: int, positions: int) -> Splice:
+    """Returns the encoder of echelon_msgs/GroupState; its values are `GROUP_FIELDS`, then as many as given of each."""
+    return Splice(Layout().header(WORLD).hole(len(GROUP_FIELDS)).holes(error_rates).holes(positions))
+
+
+def reference(accelerations: int, error_rates: int, forces: int) -> Splice:
+    """Returns the encoder of echelon_msgs/Reference; its values are as many of each, in this order."""
+    return Splice(Layout().header(WORLD).holes(accelerations).holes(error_rates).holes(forces))
+
+
+def command(accelerations: int) -> Splice:
+    """Returns the encoder of echelon_msgs/Command."""
+    return Splice(Layout().header(WORLD).holes(accelerations))
+
+
+def wheel_torque() -> Splice:
+    """Returns the encoder of echelon_msgs/WheelTorque; its values are `TORQUE_FIELDS`."""
+    return Splice(Layout().header("").hole(len(TORQUE_FIELDS)))
+
+
+def wheels(torques: int) -> Splice:
+    """Returns the encoder of echelon_msgs/Wheels."""
+    return Splice(Layout().header("").holes(torques))
+
+
+def transforms(frames: Sequence[str]) -> Template:
+    """Returns the encoder of tf2_msgs/TFMessage from the world to robots; values per robot: x, y, q_z, q_w."""
+    layout = Layout().put("I", len(frames))
+    for frame in frames:
+        layout.header(WORLD).string(frame).hole(2).put("d", 0.0, 0.0, 0.0).hole(2)
+    return Template(layout)
+
+
+def odometry(frame: str) -> Template:
+    """Returns the encoder of nav_msgs/Odometry of a robot; values: x, y, q_z, q_w, then in its own frame forward speed,
+    lateral speed, yaw rate.  Covariances are zero, which stands for unknown."""
+    layout = Layout().header(WORLD).string(frame).hole(2).put("d", 0.0, 0.0, 0.0).hole(2).put("d", *[0.0] * 36)
+    return Template(layout.hole(2).put("d", 0.0, 0.0, 0.0).hole(1).put("d", *[0.0] * 36))
+
+
+def joint_state(names: Sequence[str]) -> Template:
+    """Returns the encoder of sensor_msgs/JointState; values: the velocities of all joints, then their efforts."""
+    layout = Layout().header("").put("I", len(names))
+    for name in names:
+        layout.string(name)
+    return Template(layout.put("I", 0).holes(len(names)).holes(len(names)))
+
+
+def markers(count: int) -> Layout:
+    """Returns a visualization_msgs/MarkerArray to which `count` markers are to be added by `add_marker`."""
+    return Layout().put("I", count)
+
+
+def add_marker(
+    layout: Layout,
+    namespace: str,
+    number: int,
+    kind: int,
+    scale: tuple[float, float, float],
+    color: tuple[float, float, float, float],
+    points: Sequence[tuple[float, float]] = (),
+) -> None:
+    """Adds a marker in the world; its values are x, y, q_z, q_w, or none if it has points."""
+    layout.header(WORLD).string(namespace).put("i", number, kind, 0)
+    if points:
+        layout.put("d", *[0.0] * 6, 1.0)
+    else:
+        layout.hole(2).put("d", 0.0, 0.0, 0.0).hole(2)
+    layout.put("d", *scale).put("f", *color).put("i", 0, 0).put("B", 0).put("I", len(points))
+    if points:
+        layout.put("d", *[number for x, y in points for number in (x, y, 0.0)])
+    layout.put("I", 0).string("")  # no colours of its own for each point, no texture
+    layout.put("I", 0, 0).string("").string("").put("I", 0).put("I", 0)  # the texture's image, its coordinates
+    layout.string("").string("").string("").put("I", 0).put("B", 0)  # text, mesh, the mesh's file
+
+
+_FRAME: Final = struct.Struct("<I4xIBBBB8s")  # an empty frame_id, up to the next multiple of four; then the CAN frame
+
+
+def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> bytes:
+    """Returns a can_msgs/Frame, an extended one if the identifier needs it; `head` is from `stamp`.
+
+    Raises ValueError if `data` is longer than eight bytes."""
+    if len(data) > 8:
+        raise ValueError(f"CAN frame {can_id:#x} holds {len(data)} bytes; can_msgs/Frame takes at most 8")
+    return head + _FRAME.pack(1, can_id, remote, can_id > 0x7FF, False, len(data), data)
+
+
+def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:
+    """Returns an echelon_msgs/LinkStatistics; `name` is for people."""
+    layout = Layout().header("").put("I", counts.source, counts.receiver).put("B", counts.channel).string(name)
+    layout.put("Q", counts.sent, counts.delivered, counts.lost, counts.in_flight, counts.used, counts.held)
+    layout.put("d", counts.age_mean_ns).put("q", counts.age_max_ns)
+    return stamp(time_ns) + bytes(layout.body[8:])

@@ -1,0 +1,65 @@
+"""Puts the messages of many sources into one order of time, whatever the order in which their batches come."""
+
+from collections.abc import Iterable
+from typing import Final
+
+from echelon.messages import Message
+from echelon.plan.plan import Plan
+
+_BEFORE_ALL_NS: Final = -(1 << 62)
+
+
+def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
+    """Returns the numbers of those whose messages are recorded: robots and nodes, then the bridge, then the drives, which say
+    something of their own only in virtual time."""
+    if not plan.can.closed:
+        return range(len(plan.formation) + has_bus)
+    return range(len(plan.all_roles) if virtual else len(plan.formation) + 1)
+
+
+class TimeOrder:
+    """Messages by (time, source, channel), released once every source has gone past their time.
+
+    Each source sends in order of time.  What is released is the same for the same messages, however they came.
+    """
+
+    def __init__(self, sources: Iterable[int]) -> None:
+        self._latest = dict.fromkeys(sources, _BEFORE_ALL_NS)
+        self._waiting: dict[int, list[Message]] = {}
+        self._released_ns = _BEFORE_ALL_NS
+        self.pushed = 0
+        """Messages taken."""
+        self.refused = 0
+        """Messages of unknown sources, or older than what was released."""
+
+    def push(self, messages: list[Message]) -> list[Message]:
+        """Takes messages, in each source's order; returns those that can go now, in order."""
+        waiting, latest = self._waiting, self._latest
+        for message in messages:
+            time_ns = message.time_ns
+            if message.source not in latest or time_ns <= self._released_ns:
+                self.refused += 1
+                continue
+            self.pushed += 1
+            if time_ns > latest[message.source]:
+                latest[message.source] = time_ns
+            bucket = waiting.get(time_ns)
+            if bucket is None:
+                waiting[time_ns] = [message]
+            else:
+                bucket.append(message)
+        return self._release(min(latest.values()))
+
+    def rest(self) -> list[Message]:
+        """Returns what is left, in order: for the end of a run, when no source goes past the last instant."""
+        return self._release(1 << 63)
+
+    def _release(self, safe_ns: int) -> list[Message]:
+        """Releases everything before `safe_ns`."""
+        released: list[Message] = []
+        for time_ns in sorted(time_ns for time_ns in self._waiting if time_ns < safe_ns):
+            bucket = self._waiting.pop(time_ns)
+            bucket.sort(key=lambda message: (message.source, message.channel))
+            released.extend(bucket)
+            self._released_ns = time_ns
+        return released

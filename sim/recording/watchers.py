@@ -1,0 +1,157 @@
+"""Those who watch a run, and the first of them, the recorder.
+
+They receive members' messages in batches and put them into one order of time first.  In virtual time a watcher that is
+slow slows the run; on a wall clock it loses, and says so.
+"""
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from echelon.bridge.roles.frame_message import unpack
+from echelon.plan.layout import said_by
+from echelon.runtime.link import LinkCounts
+from echelon.messages import Channel, Message
+from echelon.plan.plan import Plan
+from echelon.runtime.session import Inbox, Session
+from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
+from echelon.sim.recording.recorder import Recorder
+from echelon.sim.results.trace import TraceBuilder
+from echelon.sim.recording.time_order import TimeOrder, speakers
+from echelon.sim.processes.to_supervisor import RecorderProgress, RecorderReport
+from echelon.runtime.wire import WireError, count_refusal, decode, split, watch_key
+
+PROGRESS_S: Final = 0.2
+SLACK_NS: Final = 60_000_000_000
+"""So long after its end a run on a wall clock may still say something."""
+HIGH_WATER: Final = 256
+"""Batches a watcher may be behind before the run waits for it."""
+DRAIN_S: Final = 10.0
+"""How long to wait for what a finished run still owes."""
+SILENCE_S: Final = 0.3
+"""How long to wait for what a broken run may still have sent."""
+
+
+class Reception:
+    """Batches from the session, in one order of time."""
+
+    def __init__(self, inbox: Inbox, sources: Iterable[int], plan: Plan) -> None:
+        self._inbox = inbox
+        self._order = TimeOrder(sources)
+        self._sizes = said_by(plan)
+        self._from_ns, self._until_ns = -plan.can.bring_up_ns, plan.duration_ns + SLACK_NS
+        self.refused: dict[str, int] = {}
+
+    def take(self, timeout_s: float) -> list[Message]:
+        """Waits for a batch; returns the messages that can go now."""
+        messages: list[Message] = []
+        for batch in self._inbox.take(timeout_s):
+            messages.extend(self._unpack(batch))
+        if not messages:
+            return []
+        return self._order.push(messages)
+
+    def _unpack(self, batch: bytes) -> Iterator[Message]:
+        try:
+            for payload in split(batch):
+                message = decode(payload)
+                size = self._sizes.get((message.source, message.channel), -1)
+                if size is not None and message.values.size not in (0, size):
+                    count_refusal(self.refused, "wrong number of values" if size >= 0 else "of nobody here")
+                elif self._from_ns <= message.time_ns <= self._until_ns:
+                    yield message
+                else:
+                    count_refusal(self.refused, "of another time")
+        except WireError as error:
+            count_refusal(self.refused, error.reason)
+
+    def drain(self, expected: int | None) -> Iterator[list[Message]]:
+        """Yields what still comes at the end of a run: all that is `expected`, or (None) until it is silent."""
+        deadline_s = time.monotonic() + DRAIN_S
+        while (expected is None or self._order.pushed < expected) and time.monotonic() < deadline_s:
+            before = self._order.pushed
+            yield self.take(SILENCE_S)
+            if expected is None and self._order.pushed == before:
+                break
+        yield self._order.rest()
+
+    @property
+    def refused_count(self) -> int:
+        """Batches that were no messages, and messages of unknown sources or out of their source's order."""
+        return sum(self.refused.values()) + self._order.refused
+
+
+def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
+    plan = spec.plan
+    sources = speakers(plan, spec.virtual, bool(spec.can_urls))
+    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
+    try:
+        recording = RunRecorder(Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files)
+    except OSError as error:
+        raise StartError(f"{error.filename}: {error.strerror}") from None
+    meet(spec, session, control)
+    said_s = time.monotonic()
+    while True:
+        recording.add(reception.take(PROGRESS_S / 2))
+        now_s = time.monotonic()
+        if now_s - said_s >= PROGRESS_S:
+            said_s = now_s
+            recording.recorder.flush_if_due(time.monotonic_ns())
+            control.send(recording.progress())
+        if (order := hear_finish(control)) is not None:
+            break
+    for messages in reception.drain(order.messages):
+        recording.add(messages)
+    recording.close(order.links)
+    finish(spec, control, report=recording.report(reception.refused_count))
+
+
+class RunRecorder:
+    """Where a run's messages go once they are in order: run.mcap and the trace."""
+
+    def __init__(
+        self,
+        folder: Path,
+        plan: Plan,
+        scenario_toml: str,
+        metadata: dict[str, str],
+        part_files: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self.recorder = Recorder(folder / "run.mcap", plan, scenario_toml, metadata, part_files)
+        self._trace = TraceBuilder(plan)
+        self.messages = 0
+        self._time_ns = 0
+        self._bridge = len(plan.formation)
+
+    def add(self, messages: Sequence[Message]) -> None:
+        """Takes messages in order of time."""
+        recorder, trace = self.recorder, self._trace
+        for message in messages:
+            self.messages += 1
+            if message.channel is Channel.FRAMES:
+                if message.source == self._bridge:  # which tells of the drives' frames, too
+                    for timed in unpack(message.values):
+                        recorder.record_frame(timed)
+            else:
+                trace.add(message)
+                recorder.record(message)
+        if messages:
+            self._time_ns = messages[-1].time_ns
+
+    def progress(self) -> RecorderProgress:
+        """Returns how far the recording is."""
+        states_ns, states = self._trace.last() or (0, None)
+        return RecorderProgress(self._time_ns, self.messages, states_ns, states, self.recorder.failure)
+
+    def close(self, links: Sequence[LinkCounts]) -> None:
+        """Writes the links' counts and ends the recording."""
+        self.recorder.record_links(self._time_ns, links)
+        self.recorder.close()
+
+    def report(self, refused: int = 0) -> RecorderReport:
+        """Returns the trace, and what became of the recording; `refused` messages did not come so far."""
+        return RecorderReport(self._trace.build(), self.messages, refused, self.recorder.failure)

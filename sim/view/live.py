@@ -1,0 +1,120 @@
+"""What a person sees while a run goes on: a live table with a progress bar, or plain lines where there is no terminal."""
+
+import sys
+import time
+from typing import Any, TextIO
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from echelon.controller.transformation import Transformation
+from echelon.plan.plan import Plan
+from echelon.sim.results.desired import Desired
+from echelon.sim.processes.supervisor import Progress
+
+PLAIN_S = 2.0
+"""Between two plain lines."""
+FAULTS = 3
+"""Faults of drives that are shown in words."""
+
+
+class Display:
+    """Shows progress on standard error; `show` may be called as often as one likes."""
+
+    def __init__(self, plan: Plan, stream: TextIO = sys.stderr, quiet: bool = False) -> None:
+        self._plan = plan
+        self._quiet = quiet
+        self._stream = stream
+        self._cbt = Transformation(plan)
+        self._trajectory = Desired(plan)
+        self._console = Console(file=stream, stderr=stream is sys.stderr)
+        self._live: Live | None = None
+        self._said_s = time.monotonic()
+        self._note = ""
+        if not quiet and self._console.is_terminal:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+            self._live.start()
+
+    def show(self, progress: Progress) -> None:
+        """Shows how the run stands."""
+        note = progress.note or progress.bridge.note or progress.drives.note
+        if note and note != self._note:
+            self.say(note)
+        self._note = note or self._note
+        if self._quiet:
+            return
+        if self._live is not None:
+            self._live.update(self._table(progress), refresh=True)
+        elif time.monotonic() - self._said_s >= PLAIN_S:
+            self._said_s = time.monotonic()
+            print(self._line(progress), file=self._stream, flush=True)
+
+    def say(self, text: str) -> None:
+        """Prints a line that stays."""
+        if self._live is not None:
+            self._console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=self._stream, flush=True)
+
+    def close(self) -> None:
+        """Takes the table away; may be called twice."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def errors(self, progress: Progress) -> dict[str, float]:
+        """Returns by block the norm of its error [m] in the robots' last states."""
+        if progress.states is None:
+            return {}
+        z_cd = self._trajectory.at(progress.states_ns * 1e-9)
+        with np.errstate(all="ignore"):
+            e = (self._cbt.forward(progress.states[:, :2]) - self._cbt.desired(z_cd[0])).ravel()
+            return {
+                block.name: float(np.linalg.norm(e[block.offset : block.offset + block.size]))
+                for block in self._plan.blocks
+            }
+
+    def _line(self, progress: Progress) -> str:
+        facts = [f"{name} {value}" for name, value in self._facts(progress)]
+        errors = [f"{name} {error:.3g} m" for name, error in self.errors(progress).items()]
+        return f"{progress.phase:>9}  {'  '.join(facts)}{'  |  ' if errors else ''}{'  '.join(errors)}"
+
+    def _facts(self, progress: Progress) -> list[tuple[str, str]]:
+        run_s, whole_s = progress.time_ns / 1e9, self._plan.duration_ns / 1e9
+        wall_s = time.monotonic() - progress.started_s if progress.started_s else 0.0
+        factor = f"{run_s / wall_s:.3g}" if wall_s > 0.2 else "–"
+        tick = progress.time_ns // self._plan.robots[0].period_ns
+        facts = [
+            ("t", f"{run_s:.2f} of {whole_s:g} s"),
+            ("tick", f"{tick}"),
+            ("real time", f"× {factor}"),
+            ("messages", f"{progress.messages}"),
+        ]
+        if progress.bridge.frames:
+            facts.append(("CAN load", f"{100 * progress.bridge.load:.0f} %"))
+        if progress.bridge.stopped:
+            facts.append(("torques stopped", progress.bridge.stopped))
+        if faults := progress.bridge.faults:
+            facts.append(("drive faults", ", ".join(faults[:FAULTS]) + (" …" if len(faults) > FAULTS else "")))
+        return facts
+
+    def _table(self, progress: Progress) -> Any:
+        table = Table(box=None, padding=(0, 2), show_header=False)
+        for name, value in self._facts(progress):
+            table.add_row(Text(name, style="dim"), value)
+        if progress.bridge.url:
+            table.add_row(Text("bus", style="dim"), progress.bridge.url)
+        errors = Table(box=None, padding=(0, 2))
+        errors.add_column("block", style="dim")
+        errors.add_column("error [m]", justify="right")
+        for name, error in self.errors(progress).items():
+            errors.add_row(name, f"{error:.4g}")
+        bar = ProgressBar(total=self._plan.duration_ns, completed=progress.time_ns, width=60)
+        columns = Table.grid(padding=(0, 6))
+        columns.add_row(table, errors)
+        title = Text(f"{self._plan.name}: {progress.phase}", style="bold")
+        return Group(title, bar, columns)

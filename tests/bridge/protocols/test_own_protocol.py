@@ -1,0 +1,234 @@
+"""A drive protocol in a file beside the scenario: the example runs, and one that is wrong is named in one line."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from echelon.bridge.can.canlog import read_log
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.plan_dbc import plan_dbc
+from echelon.bridge.protocols.registry import make_drive, make_host, make_observer
+from echelon.errors import PartRunError
+from echelon.planning.loading import ScenarioError
+from echelon.plan.plan import Plan
+from echelon.sim.engines.in_process import Engine
+from echelon.sim.parts.loading import load
+from support.runs import EXAMPLES, echelon, summary_of
+
+TEXT = (EXAMPLES / "my_drive.py").read_text()
+QUIET = ("--quiet", "--no-report")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The user's folder."""
+    for path in EXAMPLES.glob("my_drive.*"):
+        shutil.copy(path, tmp_path)
+    return tmp_path
+
+
+def changed(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Changes the protocol; returns its scenario."""
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "my_drive.py").write_text(text)
+    return folder / "my_drive.toml"
+
+
+def failing(method: str, line: str, owner: str = "MyHost(CyclicHost)") -> tuple[str, str]:
+    """Returns the change that makes a method of a host or drive do something else from 0.3 s on."""
+    where = f"class {owner}:"
+    (found,) = [row for row in TEXT.splitlines() if row.startswith(where)]
+    return found, (
+        f"{found}\n    def {method}(self, *arguments):\n"
+        f"        if arguments and arguments[0] > 300_000_000: {line}\n"
+        f"        return super().{method}(*arguments)\n"
+    )
+
+
+def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Path) -> None:
+    scenario = folder / "my_drive.toml"
+    runs = {}
+    for engine in ("inprocess", "processes"):
+        done = echelon("run", scenario, "--engine", engine, *QUIET, "--out", tmp_path / engine)
+        assert done.returncode == 0, done.stdout + done.stderr
+        runs[engine] = summary_of(tmp_path / engine)
+        (folder / "my_drive.py").write_text(TEXT)
+    one, many = runs.values()
+    assert one["trace_digest"] == many["trace_digest"]
+    assert (tmp_path / "inprocess" / "can.log").read_bytes() == (tmp_path / "processes" / "can.log").read_bytes()
+    assert one["verdict"]["holds"]
+    assert one["can"]["referee"]["findings"] == []
+    for row in many["can"]["robots"].values():
+        assert (row["protocol"], row["enabled"], row["fault"]) == ("my_drive.py:MyProtocol", True, "")
+        assert 0.01 < row["largest"] < 1.5
+    # The run's folder has the protocol, too: it can be looked at without the user's.
+    shown = echelon("can", tmp_path / "inprocess", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert "r3" in shown.stdout
+
+
+def test_on_a_wall_clock_too(folder: Path, tmp_path: Path) -> None:
+    sets = ("--set", "duration=1.0", "--set", "claims=[]", "--set", "can.watchdog=0.5")
+    done = echelon("run", folder / "my_drive.toml", "--clock", "wall", *sets, *QUIET, "--out", tmp_path / "run")
+    assert done.returncode in (0, 1), done.stderr  # a busy machine may be late
+    rows = summary_of(tmp_path / "run")["can"]["robots"].values()
+    assert all(row["commands"] > 50 and row["protocol"] == "my_drive.py:MyProtocol" for row in rows)
+
+
+def test_the_dbc_and_the_mirrored_path(folder: Path, tmp_path: Path) -> None:
+    _, plan = load(folder / "my_drive.toml")
+    assert 'BO_ 770 torque_r3: 5 bridge\n SG_ flags : 32|8@1+ (1,0) [0|0] ""  r3' in plan_dbc(plan).replace("\r", "")
+    sets = ("--set", "can.path=mirror", "--set", "duration=0.5", "--set", "claims=[]", "--can", "virtual")
+    done = echelon("run", folder / "my_drive.toml", "--engine", "inprocess", *sets, *QUIET, "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    frames = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log")]
+    assert len(frames) == 3 * 50
+    assert {frame.can_id for frame in frames} == {0x300, 0x301, 0x302}
+    assert all(frame.data[4] == 1 for frame in frames)
+    assert summary_of(tmp_path / "run")["can"]["referee"]["findings"] == []
+
+
+@pytest.mark.parametrize("engine", ["inprocess", "processes"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (failing("command", "raise KeyError('w')"), "its host's command raised KeyError: 'w'"),
+        (failing("advance", "return None", "MyDrive(CyclicDrive)"), "its drive's advance must return a list of frames"),
+    ],
+)
+def test_what_fails_in_a_run_is_one_line_and_wheels_are_stopped_first(
+    folder: Path, tmp_path: Path, engine: str, change: tuple[str, str], says: str
+) -> None:
+    scenario = changed(folder, change)
+    done = echelon("run", scenario, "--engine", engine, *QUIET, "--out", tmp_path / "run")
+    assert done.returncode == 3
+    (line,) = done.stderr.splitlines()
+    assert f"my_drive.py:MyProtocol of r1: {says}" in line
+    frames = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log")]
+    assert [(frame.can_id, frame.data) for frame in frames[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
+    verdict = json.loads((tmp_path / "run" / "summary.json").read_text())["verdict"]
+    assert not verdict["holds"]
+    assert says in verdict["reasons"][0]
+
+
+def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Path) -> None:
+    scenario = changed(folder, failing("command", "raise KeyError('w')"))
+    sets = ("--set", "claims=[]", "--set", "can.watchdog=0.5")
+    done = echelon("run", scenario, "--clock", "wall", *sets, *QUIET, "--out", tmp_path / "run")
+    assert done.returncode == 3
+    assert "echelon: my_drive.py:MyProtocol of r" in done.stderr
+    assert "its host's command raised KeyError: 'w'" in done.stderr
+    commands = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log") if frame.can_id < 0x380]
+    assert [(frame.can_id, frame.data) for frame in commands[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
+
+
+def test_a_host_that_cannot_even_stop_is_made_to_ask_for_no_torque(folder: Path) -> None:
+    scenario = changed(folder, failing("stop", "raise RuntimeError('no')"))
+    _, plan = load(scenario, ["duration=0.5", "claims=[]"])
+    engine = Engine(plan)
+    engine.run()
+    commander = engine.commander
+    assert commander is not None
+    frames, failure = commander.stop(plan.duration_ns)
+    assert [timed.frame for timed in frames] == [Frame(0x300 + robot, bytes(5)) for robot in range(3)]
+    assert failure == "my_drive.py:MyProtocol of r1: its host's stop raised RuntimeError: no"
+
+
+def first(plan: Plan) -> object:
+    host = make_host(plan.robots[0])
+    host.receive(400_000_000, Frame(0x380, bytes(5)))
+    return host.command(400_000_000, 0.0, 0.0)
+
+
+def advanced(plan: Plan) -> object:
+    from echelon.bridge.protocols.registry import drive_places
+
+    drive = make_drive(plan, drive_places(plan)[0])
+    return drive.advance(400_000_000)
+
+
+def observed(plan: Plan) -> object:
+    return make_observer(plan.robots[0], True).observe(400_000_000, Frame(0x300, bytes(5)))
+
+
+@pytest.mark.parametrize(
+    ("change", "ask", "says"),
+    [
+        (failing("command", "return [(0x300, b'')]"), first, "its host's command must return frames"),
+        (failing("command", "return [Frame(0x300, 'no')]"), first, "its host's command: a frame has up to 8 bytes"),
+        (failing("command", "return [Frame(0x300, bytes(9))]"), first, "its host's command: a frame has up to 8 bytes"),
+        (failing("command", "return [Frame(0x7FF)]"), first, "command sends identifier 0x7ff, which `identifiers`"),
+        (failing("command", "return Frame(0x300)"), first, "its host's command must return a list of frames"),
+        (
+            failing("receive", "self.torque = 1.0, float('nan'); return"),
+            first,
+            "after receive: torque must be two finite",
+        ),
+        (
+            failing("receive", "self.torque = None; return"),
+            first,
+            "its host after receive: torque must be two finite numbers",
+        ),
+        (failing("receive", "1 / 0"), first, "its host's receive raised ZeroDivisionError: division by zero"),
+        (failing("advance", "return [Frame(0x381)]", "MyDrive(CyclicDrive)"), advanced, "sends identifier 0x381"),
+        (failing("advance", "return []", "MyDrive(CyclicDrive)"), advanced, "though advance(400000000) has done what"),
+        (
+            failing("observe", "return 7", "MyObserver(CyclicObserver)"),
+            observed,
+            "observe must return a list of Finding",
+        ),
+        (
+            failing("observe", "self.wheels[0].reported = 'much'", "MyObserver(CyclicObserver)"),
+            observed,
+            "its observer reads a torque that is no finite number: 'much'",
+        ),
+    ],
+)
+def test_what_returns_no_frames_is_named(folder: Path, change: tuple[str, str], ask: object, says: str) -> None:
+    _, plan = load(changed(folder, change))
+    assert callable(ask)
+    with pytest.raises(PartRunError) as caught:
+        ask(plan)
+    assert str(caught.value).startswith("my_drive.py:MyProtocol of r1: ")
+    assert says in str(caught.value)
+
+
+HOST = "    def host(self, drive: DrivePlan) -> MyHost:\n        return MyHost(drive, [FEEDBACK + drive.node_ids[0]])\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (HOST, "", "MyProtocol lacks the method host"),
+        ("    def encode(", "    def encodes(", "host raised TypeError: Can't instantiate abstract class MyHost"),
+        ("    def report(", "    def reports(", "drive raised TypeError: Can't instantiate abstract class MyDrive"),
+        ("return MyHost(drive, [", "return (drive, [", "what host returns lacks clipped, command, enabled, estop, fault"),
+        ("return MyDrive(drive, [", "return (drive, [", "what drive returns lacks advance, due_ns"),
+        ("wheels = ((0, 1),)", "wheels = (0, 1)", "MyProtocol.wheels must be ((0,), (1,)) or ((0, 1),), not (0, 1)"),
+        ("    by_number", "    nodes = 7\n    by_number", "MyProtocol.nodes must be a range of node ids, not 7"),
+        ("COMMAND + node, FEEDBACK + node)", "COMMAND + nodes,)", "identifiers raised NameError"),
+        ("return frozenset((", "return list((", "identifiers must be a set of numbers from 0 to 0x7ff, not [768"),
+        ("FEEDBACK = 0x300, 0x380", "FEEDBACK = 0x300, 0x7FE", "from 0 to 0x7ff, not frozenset({"),
+        ("0x380  # each", "0x301  # each", "identifier 0x301 of r2 collides with those of r1; give another bus"),
+        ("by_number = True", "by_number = False", "node_ids = [1, 2]: one, twice, from 0 to 126 are needed"),
+        ("        return [\n            Message(", "        return [Message(1, 'a', 8, [])] + [\n            Message(",
+         "messages describes identifier 0x001, which `identifiers` does not name"),
+        ("        return [\n            Message(COMMAND", "        return [] and [\n            Message(COMMAND",
+         "observer: identifier 0x300 comes regularly, but `messages` does not describe it"),
+        ('("tau_left", 16)', '("tau_left", 8)', "messages raised Error: The signals tau_left and tau_right are overlapping"),
+        ("return MyObserver(drive,", "return 7, (drive,", "what observer returns lacks cyclic, identifiers, observe, wheels"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_or_wrong_is_said_before_the_start(folder: Path, old: str, new: str, says: str) -> None:
+    scenario = changed(folder, (old, new))
+    sets = ["robot.drive.node_ids=[1,2]"] if "twice" in says else []
+    with pytest.raises(ScenarioError) as caught:
+        load(scenario, sets)
+    assert len(str(caught.value).splitlines()) == 1
+    assert "my_drive" in str(caught.value)
+    assert says in str(caught.value)

@@ -1,0 +1,125 @@
+"""The bridge: one frame per robot and period, and never torque that nobody commanded."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from echelon.bridge.timing.bus_load import frame_bits
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.native.codec import NativeCodec, Torque
+from echelon.bridge.protocols.native.counter import CounterCheck
+from echelon.bridge.protocols.native.host import NativeHost
+from echelon.bridge.reports import WheelsReport
+from echelon.bridge.roles.torque_mirror import Stop, TorqueMirror
+from support.bench_drives import drive_plan
+
+MS = 1_000_000
+CODEC = NativeCodec(0.001)
+
+
+def make() -> TorqueMirror:
+    return TorqueMirror([host(0), host(1)], 10 * MS)
+
+
+def host(robot: int) -> NativeHost:
+    return NativeHost(drive_plan("native", (robot, robot)))
+
+
+def said(robot: int, right: float, left: float, enable: bool, counter: int) -> Torque:
+    return Torque(robot, right, left, enable, enable, False, False, False, False, counter)
+
+
+def decode(frames: list[Frame]) -> Torque:
+    ((can_id, data, _),) = frames
+    frame = CODEC.decode(can_id, data)
+    assert isinstance(frame, Torque)
+    return frame
+
+
+def test_one_frame_per_robot_and_period_in_order() -> None:
+    bridge = make()
+    frames = [bridge.encode(step * 10 * MS, robot, 1.0 + robot, -0.5) for step in range(20) for robot in (0, 1)]
+    assert [decode(one) for one in frames] == [
+        said(robot, 1.0 + robot, -0.5, True, step % 16) for step in range(20) for robot in (0, 1)
+    ]
+    assert bridge.frames == 40
+    assert sum(counts.bits.bits for counts in bridge.counts) == sum(
+        frame_bits(can_id, data) for ((can_id, data, _),) in frames
+    )
+    assert [counts.skipped for counts in bridge.counts] == [0, 0]
+
+
+@pytest.mark.parametrize("torques", [(math.nan, 1.0), (1.0, math.inf), (-math.inf, math.nan)])
+def test_torque_that_is_not_finite_stops_the_drives(torques: tuple[float, float]) -> None:
+    bridge = make()
+    bridge.encode(0, 1, 5.0, 5.0)
+    assert decode(bridge.encode(10 * MS, 1, *torques)) == said(1, 0.0, 0.0, False, 1)
+    assert bridge.counts[1].stopped == {Stop.NOT_FINITE: 1}
+    assert (bridge.counts[1].smallest, bridge.counts[1].largest) == ((5.0, 5.0), (5.0, 5.0))
+    assert decode(bridge.encode(20 * MS, 1, 2.0, 2.0)) == said(1, 2.0, 2.0, True, 2)
+
+
+def test_old_torque_stops_the_drives_and_a_repeated_one_gives_nothing() -> None:
+    bridge = make()
+    bridge.encode(20 * MS, 0, 1.0, 1.0)
+    assert decode(bridge.encode(10 * MS, 0, 1.0, 1.0)) == said(0, 0.0, 0.0, False, 1)
+    assert bridge.encode(20 * MS, 0, 1.0, 1.0) == []
+    assert decode(bridge.encode(10 * MS, 1, 1.0, 1.0)).enable_right  # each robot has its own time
+    counts = bridge.counts[0]
+    assert (counts.frames, counts.stopped, counts.repeated) == (2, {Stop.STALE: 1}, 1)
+
+
+def test_periods_without_torque_are_counted() -> None:
+    bridge = make()
+    for step in (0, 1, 2, 5, 6, 10):
+        bridge.encode(step * 10 * MS + (step % 2 == 0), 0, 0.0, 0.0)  # a nanosecond of jitter is no period
+    assert bridge.counts[0].skipped == 2 + 3
+
+
+def test_stop_on_request() -> None:
+    bridge = make()
+    assert not decode(bridge.stop(1)).enable_right
+    assert not decode(bridge.stop(1, Stop.MISSING)).enable_right
+    assert bridge.counts[1].stopped == {Stop.REQUESTED: 1, Stop.MISSING: 1}
+
+
+def test_report() -> None:
+    bridge = make()
+    bridge.encode(0, 0, 40.0, -1.0)
+    bridge.encode(10 * MS, 0, -2.0, 50.0, saturated=True)
+    bridge.encode(20 * MS, 0, math.nan, 0.0)
+    stopped = {"not finite": 1}
+    assert bridge.report(0, "native") == WheelsReport("native", 3, stopped, 50.0, clipped=2, saturated=1)
+    assert bridge.report(1, "native") == WheelsReport("native", 0, {}, 0.0)
+    assert bridge.frames == 3
+
+
+torques = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 1), torques, torques, st.booleans())))
+def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> None:
+    bridge = make()
+    checks = [CounterCheck(), CounterCheck()]
+    total = 0
+    for time, robot, right, left, saturated in calls:
+        for can_id, data, _ in bridge.encode(time * 10 * MS, robot, right, left, saturated):
+            frame = CODEC.decode(can_id, data)
+            assert isinstance(frame, Torque)
+            assert frame.robot == robot
+            assert checks[robot].step(frame.counter) == 0
+            assert frame.enable_right == frame.enable_left
+            assert frame.enable_right or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
+            assert not frame.enable_right or (math.isfinite(right) and math.isfinite(left))
+            total += 1
+    assert total == bridge.frames == sum(counts.frames for counts in bridge.counts)
+    assert total + sum(counts.repeated for counts in bridge.counts) == len(calls)
+
+
+def test_refused() -> None:
+    with pytest.raises(ValueError, match="period"):
+        TorqueMirror([host(0)], 0)
+    with pytest.raises(IndexError):
+        make().encode(0, 2, 0.0, 0.0)

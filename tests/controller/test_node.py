@@ -1,0 +1,267 @@
+"""The law in the tree, node by node and message by message, against the law of all robots at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.trees import PAPER_TREE, Tree, plan_of, random_epsilon, scenario, trees, with_random_gains
+
+from echelon import controller
+from echelon.agents.plant import state_at
+from echelon.agents.robot import Robot
+from echelon.controller.laws.central import CentralLaw
+from echelon.controller.laws.in_tree import BlockGains
+from echelon.plan.layout import sized
+from echelon.messages import NULL, STATE_FIELDS, Channel, Message
+from echelon.plan.plan import Array, AvoidancePlan, LinkPlan, Plan
+from echelon.sim.engines.in_process import Engine
+
+SETTINGS = settings(derandomize=True, deadline=None, max_examples=60)
+SEEDS = st.integers(0, 2**32 - 1)
+NEAR = AvoidancePlan(True, avoidance_radius=0.3, sensing_radius=4.0, force_limit=500.0)
+FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
+
+
+LAWS = {
+    "linear": {},
+    "integral": {"k_i": 0.3, "limit": 0.01},  # so small that the integral is cut off
+    "terminal_sliding": {"gamma": 1.7, "beta": 2.0, "kappa": 1.5},
+}
+assert set(LAWS) == set(controller.laws.LAWS)
+
+
+def random_plan(
+    tree: Tree, seed: int, time_scales: str, coupling: float, avoidance: bool, use: str = "linear", **tables
+) -> Plan:
+    random = np.random.default_rng(seed)
+    law = random_epsilon(tree, random, time_scales) | {"lead": random.choice([0.0, 0.5])}
+    law |= {"use": use, "parameters": LAWS[use]}
+    plan = with_random_gains(plan_of(scenario(tree, random, law=law, **tables)), random, coupling)
+    return sized(replace(plan, avoidance=NEAR)) if avoidance else plan
+
+
+class Watched:
+    """An engine whose robots start anywhere, and all that was said in it, by (channel, source, instant)."""
+
+    def __init__(self, plan: Plan, seed: int) -> None:
+        self.plan = plan
+        self.said: dict[tuple[Channel, int, int], Message] = {}
+        self.engine = Engine(plan, self._note)
+        random = np.random.default_rng(seed)
+        for role in self.engine.roles:
+            if isinstance(role, Robot):
+                x, y = plan.robots[role.index].start
+                role.state = state_at(x, y, *random.normal(size=3, scale=(2, 3, 2)).tolist())
+        self.instants = list(self.engine.instants())
+
+    def _note(self, message: Message) -> None:
+        self.said[message.channel, message.source, message.time_ns] = message
+
+    def states(self, time_ns: int) -> Array:
+        """Returns the states of all robots at an instant, (N, fields)."""
+        return np.array([self.said[Channel.STATE, robot.index, time_ns].values for robot in self.plan.robots])
+
+    def commanded(self, time_ns: int) -> Array:
+        """Returns the accelerations that the robots were sent at an instant, (N, 2)."""
+        return np.array(
+            [
+                self.said[Channel.COMMAND, robot.parent, time_ns].values.reshape(-1, 2)[robot.child_number]
+                for robot in self.plan.robots
+            ]
+        )
+
+
+@SETTINGS
+@given(
+    trees(),
+    SEEDS,
+    st.sampled_from(["three", "multi"]),
+    st.sampled_from([0.0, 0.5]),
+    st.booleans(),
+    st.sampled_from(sorted(LAWS)),
+)
+def test_tree_computes_what_the_central_law_does(tree, seed, time_scales, coupling, avoidance, use):
+    plan = random_plan(tree, seed, time_scales, coupling, avoidance, use)
+    central, run = CentralLaw(plan), Watched(plan, seed)
+    assert plan.coupled == (coupling > 0 and len(plan.robots) > 1)
+    for time_ns in run.instants:
+        states = run.states(time_ns)
+        expected = central(time_ns * 1e-9, states[:, :2], states[:, 2:4])
+        precision = 1e-9 if use == "terminal_sliding" else 1e-12  # its slope is steep where the error is small
+        np.testing.assert_allclose(run.commanded(time_ns), expected, atol=precision * (1 + np.abs(expected).max()))
+    assert run.engine.messages == len(run.said)
+
+
+def test_nine_robots_that_avoid_each_other_do_feel_it():
+    """The random trees above mean something only if their forces do."""
+    plan = random_plan(PAPER_TREE, 5, "three", 0.5, avoidance=True)
+    near = Watched(plan, 5).commanded(0)
+    far = Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 5).commanded(0)
+    assert np.abs(near - far).max() > 1.0
+
+
+@SETTINGS
+@given(trees(max_robots=8), SEEDS)
+def test_torque_is_that_of_the_acceleration(tree, seed):
+    """u = B⁻¹(a - A ṗ - C), label 801 literally; the period is so short that nothing turns meanwhile."""
+    periods = {"acceleration": 1e-9, "torque": 1e-9}
+    plan = random_plan(tree, seed, "three", 0.5, avoidance=True, duration=1e-9, periods=periods)
+    run = Watched(plan, seed)
+    before, after = (run.states(time_ns) for time_ns in run.instants)
+    for robot, a, state, did in zip(plan.robots, run.commanded(0), before, after, strict=True):
+        np.testing.assert_array_equal(did[[FIELD["ax"], FIELD["ay"]]], a)
+        theta, omega = state[FIELD["theta"]], state[FIELD["omega"]]
+        m1, d, r, R = robot.mass, robot.offset, robot.wheel_radius, robot.arm
+        J, s, c = robot.inertia - m1 * d**2, np.sin(theta), np.cos(theta)
+        A = omega * np.array([[-s * c, -s * s], [c * c, s * c]])
+        B = np.array(
+            [
+                [c / (m1 * r) - d * R * s / (J * r), c / (m1 * r) + d * R * s / (J * r)],
+                [s / (m1 * r) + d * R * c / (J * r), s / (m1 * r) - d * R * c / (J * r)],
+            ]
+        )
+        C = -d * omega**2 * np.array([c, s])
+        # The half-step lead of 0.5 ns moves it by about 1e-9 of |a| ω.
+        u = np.linalg.solve(B, a - A @ state[2:4] - C)
+        np.testing.assert_allclose(did[[FIELD["tau_right"], FIELD["tau_left"]]], u, rtol=1e-5, atol=1e-5)
+
+
+def test_null_until_every_child_was_heard():
+    """One robot's states take 2 ms: its leader, all above and all below that leader's parent are silent until then."""
+    tree = ((None, None), (None, None))
+    plan = random_plan(tree, 1, "three", 0.5, avoidance=True, duration=0.004)
+    late = tuple(
+        replace(link, delay_min_ns=2_000_000, delay_max_ns=2_000_000) if link.source == 0 else link
+        for link in plan.links
+    )
+    run = Watched(replace(plan, links=late), 1)
+    first, second, root = (node.index for node in plan.nodes)
+    for time_ns in run.instants:
+        silent = time_ns < 2_000_000
+        assert run.said[Channel.GROUP_STATE, first, time_ns].is_null == silent
+        assert not run.said[Channel.GROUP_STATE, second, time_ns].is_null
+        for channel, source in ((Channel.REFERENCE, root), (Channel.COMMAND, first), (Channel.COMMAND, second)):
+            assert run.said[channel, source, time_ns].is_null == silent
+    # Without a command there is no torque, and nothing is counted as saturated.
+    for time_ns in run.instants[1:3]:
+        np.testing.assert_array_equal(run.states(time_ns)[:, FIELD["ax"] :], 0.0)
+    assert (run.states(run.instants[3])[:, FIELD["tau_right_peak"]] > 0).all()
+
+
+def test_a_node_whose_parent_is_silent_commands_nothing():
+    plan = random_plan(((None, None), (None, None)), 1, "three", 0.0, avoidance=False)
+    leader = Watched(plan, 1).engine.roles[plan.nodes[0].index]
+    gather, steer = leader.stages
+    states = [Message(Channel.STATE, robot, 0, 0, np.ones(len(STATE_FIELDS))) for robot in (0, 1)]
+    gather.run(0, states)
+    (message,) = steer.run(0, [None])
+    assert message.is_null
+    assert message.channel is Channel.COMMAND
+    (message,) = steer.run(0, [Message(Channel.REFERENCE, plan.root.index, 0, 0, np.ones(4))])
+    assert message.values.shape == (4,)
+    gather.run(0, [states[0], None])
+    (message,) = steer.run(0, [Message(Channel.REFERENCE, plan.root.index, 0, 0, np.ones(4))])
+    assert message.values is NULL
+
+
+def slow_root(ratio: int, coupling: float, avoidance: bool, ticks: int = 9) -> Plan:
+    table = scenario(PAPER_TREE, np.random.default_rng(2), duration=0.001 * ratio * (ticks // ratio))
+    table["formation"]["period"] = 0.001 * ratio
+    table["law"] = {"epsilon": [0.5, 0.5], "lead": 0.5}
+    plan = with_random_gains(plan_of(table), np.random.default_rng(3), coupling)
+    return sized(replace(plan, avoidance=NEAR)) if avoidance else plan
+
+
+@pytest.mark.parametrize("ratio", [2, 3])
+@pytest.mark.parametrize("coupling", [0.0, 0.5])
+def test_slow_coordinator_holds_what_it_said(ratio, coupling):
+    """Leaders act every T on what they see; ν of inter and centroid, and what others' rates do, are of the last k T."""
+    plan = slow_root(ratio, coupling, avoidance=False)
+    run = Watched(plan, 7)
+    cbt, gains = CentralLaw(plan).transformation, [BlockGains.of(plan, block) for block in plan.blocks]
+    trajectory = CentralLaw(plan).trajectory
+    intra = slice(0, 12)
+
+    def error(time_ns: int) -> tuple[Array, Array, Array]:
+        states, z_cd = run.states(time_ns), trajectory.at(time_ns * 1e-9)
+        e, e_dot = cbt.forward(states[:, :2]) - cbt.desired(z_cd[0]), cbt.forward(states[:, 2:4])
+        e_dot[-1] -= z_cd[1]
+        return e.ravel(), e_dot.ravel(), z_cd[2]
+
+    for time_ns in run.instants:
+        due = time_ns % (ratio * 1_000_000) == 0
+        assert ((Channel.REFERENCE, plan.root.index, time_ns) in run.said) == due
+        assert all(((Channel.GROUP_STATE, node.index, time_ns) in run.said) == due for node in plan.nodes[:-1])
+        now, last = error(time_ns), error(time_ns - time_ns % (ratio * 1_000_000))
+        nu = np.zeros(18)
+        for block, gain in zip(plan.blocks, gains, strict=True):
+            rows = slice(block.offset, block.offset + block.size)
+            e, e_dot, _ = now if rows.stop <= intra.stop else last
+            nu[rows] = -gain.K_1 @ e[rows] - gain.K_2 @ e_dot[rows] - gain.K_coupling @ last[1]
+        nu[-2:] += last[2]
+        expected = cbt.backward(nu.reshape(-1, 2))
+        np.testing.assert_allclose(run.commanded(time_ns), expected, atol=1e-12 * (1 + np.abs(expected).max()))
+
+
+def test_slow_coordinator_hands_down_forces_of_its_own_pairs_only():
+    """Within a group robots avoid each other at T; between groups by the forces of the last k T."""
+    plan = slow_root(3, 0.0, avoidance=True)
+    run, quiet = Watched(plan, 7), Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 7)
+    np.testing.assert_array_equal(run.states(0), quiet.states(0))
+    time_ns = 3_000_000
+    states = run.states(time_ns)
+    expected = CentralLaw(plan)(time_ns * 1e-9, states[:, :2], states[:, 2:4])
+    np.testing.assert_allclose(run.commanded(time_ns), expected, atol=1e-12 * np.abs(expected).max())
+    for time_ns in (1_000_000, 2_000_000, 4_000_000):
+        reference = run.said[Channel.REFERENCE, plan.root.index, time_ns - time_ns % 3_000_000]
+        forces = reference.values[-18:].reshape(-1, 2)
+        for node in plan.nodes[:-1]:
+            below = slice(node.first_robot, node.first_robot + 3)
+            group_plan = replace(plan, avoidance=replace(NEAR, enabled=False))
+            x = run.states(time_ns)[:, :2]
+            bare = _leader_alone(group_plan, node.index, run, time_ns, reference.values[:6])
+            pair = _forces_within(x[below]) + forces[below]
+            phi = np.array([[2**-0.5, -(2**-0.5), 0], [-0.5, -0.5, 1], [1 / 3, 1 / 3, 1 / 3]])
+            f_pot = phi @ pair
+            gain = BlockGains.of(plan, plan.block_of(node.index)).K_pot
+            nu = np.vstack([(gain @ f_pot[:-1].ravel()).reshape(-1, 2), np.zeros(2)])
+            expected = bare + np.linalg.solve(phi, nu)
+            tolerance = 1e-11 * (1 + np.abs(expected).max())
+            np.testing.assert_allclose(run.commanded(time_ns)[below], expected, atol=tolerance)
+
+
+def _leader_alone(plan: Plan, index: int, run: Watched, time_ns: int, reference: Array) -> Array:
+    """Returns what a leader commands for given states and a given reference where nobody avoids anybody."""
+    leader = Engine(plan).roles[index]
+    node = plan.formation[index]
+    leader.stages[0].run(time_ns, [run.said[Channel.STATE, child, time_ns] for child in node.children])
+    (message,) = leader.stages[1].run(time_ns, [Message(Channel.REFERENCE, plan.root.index, 0, 0, reference)])
+    return message.values.reshape(-1, 2)
+
+
+def _forces_within(x: Array) -> Array:
+    """Returns ∇f within a group, pair by pair from the formula of the potential's slope."""
+    f = np.zeros_like(x)
+    for i in range(len(x)):
+        for j in range(len(x)):
+            s = float(np.hypot(*(x[i] - x[j])))
+            if i != j and s < 4.0:
+                slope = 4 * s * (16 - s**2) * (16 - 0.09) / (s**2 - 0.09) ** 3 if s > 0.3 else np.inf
+                f[i] += min(slope, 500.0) * (x[i] - x[j]) / s
+    return f
+
+
+def test_links_of_a_plan_are_those_its_roles_listen_to():
+    plan = random_plan((None, (None, (None, None)), None), 3, "multi", 0.5, avoidance=True)
+    run = Watched(plan, 3)
+    listened = {
+        (heard.source, role.index, heard.channel)
+        for role in run.engine.roles
+        for stage in role.stages
+        for heard in stage.inputs
+    }
+    assert listened == {(link.source, link.receiver, link.channel) for link in plan.links}
+    assert all(isinstance(link, LinkPlan) and link.ideal for link in plan.links)
+    assert all(mailbox.unexpected == 0 for mailbox in run.engine.mailboxes)

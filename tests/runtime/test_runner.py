@@ -1,0 +1,434 @@
+"""The runner moves its role as the in-process engine would, whatever comes when, and tells what goes wrong."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.runs import plan_of, trace_of
+
+import echelon.runtime.runner
+from echelon.runtime.mailbox import LEAD
+from echelon.messages import Channel, Heard, Message
+from echelon.plan.plan import Plan
+from echelon.role import Role, Stage
+from echelon.runtime.runner import MAX_BATCHES, Runner
+from echelon.runtime.session import Receive
+from echelon.sim.engines.in_process import Engine, make_role
+from echelon.sim.results.trace import TraceBuilder
+from echelon.runtime.wire import data_key, decode, encode, split
+
+RUN = "test"
+TIMEOUT_S = 20.0
+LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
+LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0}]'
+LOST = 'links=[{channel="command",receiver="g1/*",loss=1.0},{channel="group_state",source="g2",loss=1.0}]'
+
+
+class Network:
+    """Sessions in memory.  What is put waits, per sender and receiver in order, until it is delivered."""
+
+    def __init__(self) -> None:
+        self.receivers: dict[str, list[tuple[str, Receive]]] = {}
+        self.queues: dict[tuple[str, str], deque[tuple[Receive, bytes]]] = {}
+        self.watched: dict[str, list[bytes]] = {}
+        self.changed = threading.Condition()
+
+    def session(self, name: str) -> Any:
+        """Returns the session of one process."""
+
+        def subscribe(keys: Sequence[str], receive: Receive) -> None:
+            for key in keys:
+                self.receivers.setdefault(key, []).append((name, receive))
+
+        def publisher(key: str) -> Any:
+            def put(payload: bytes) -> None:
+                with self.changed:
+                    if "@watch" in key:
+                        self.watched.setdefault(key, []).append(payload)
+                    for receiver, receive in self.receivers.get(key, ()):
+                        self.queues.setdefault((name, receiver), deque()).append((receive, payload))
+                    self.changed.notify_all()
+
+            return SimpleNamespace(put=put)
+
+        return SimpleNamespace(subscribe=subscribe, publisher=publisher)
+
+    def deliver(self, choose: random.Random, done: Callable[[], bool]) -> None:
+        """Delivers in bursts, of a sender and a receiver drawn each time, until `done`."""
+        while True:
+            with self.changed:
+                assert self.changed.wait_for(lambda: done() or any(self.queues.values()), TIMEOUT_S), "all stand still"
+                if done():
+                    return
+                queue = choose.choice([queue for queue in self.queues.values() if queue])
+                burst = [queue.popleft() for _ in range(min(len(queue), choose.randint(1, 9)))]
+            for receive, payload in burst:
+                receive(payload)
+
+
+class Member:
+    """A runner alone, with the test for its network: `said` is what it put, `batches` what it put for watchers."""
+
+    def __init__(self, plan: Plan, role: Role, *, virtual: bool = True) -> None:
+        self.said: list[bytes] = []
+        self.batches: list[bytes] = []
+        self.data_gate, self.watch_gate = threading.Event(), threading.Event()
+        self.data_gate.set()
+        self.watch_gate.set()
+        self.at_gate = threading.Event()
+        self.receive: Receive = lambda payload: None
+        self.failure: BaseException | None = None
+        self.waits: list[tuple[int, list[int]]] = []
+        self.on_wait: Callable[[], None] = lambda: None
+        self.waiting = threading.Event()
+
+        def subscribe(keys: Sequence[str], receive: Receive) -> None:
+            self.receive = receive
+
+        def publisher(key: str) -> Any:
+            gate, out = (self.watch_gate, self.batches) if "@watch" in key else (self.data_gate, self.said)
+
+            def put(payload: bytes) -> None:
+                if not gate.is_set():
+                    self.at_gate.set()
+                    assert gate.wait(TIMEOUT_S)
+                out.append(payload)
+
+            return SimpleNamespace(put=put)
+
+        session: Any = SimpleNamespace(subscribe=subscribe, publisher=publisher)
+        self.runner = Runner(role, plan, session, RUN, watched=True, virtual=virtual)
+        self.thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        def on_wait(time_ns: int, sources: list[int]) -> None:
+            self.waits.append((time_ns, sources))
+            self.waiting.set()
+            self.on_wait()
+
+        try:
+            self.runner.lockstep(on_wait)
+        except BaseException as error:
+            self.failure = error
+        finally:
+            self.runner.finish()
+
+    def join(self) -> None:
+        """Waits for the end of the run."""
+        self.thread.join(TIMEOUT_S)
+        assert not self.thread.is_alive()
+
+    def watched(self) -> list[bytes]:
+        """Returns the messages that watchers got."""
+        return [payload for batch in self.batches for payload in split(batch)]
+
+
+@cache
+def plan_and_digest(name: str, *overrides: str) -> tuple[Plan, str]:
+    """Returns a plan, and the digest of its trace in one process."""
+    plan = plan_of(name, *overrides)
+    return plan, trace_of(plan).digest()
+
+
+@cache
+def story(*overrides: str) -> tuple[Plan, list[Message]]:
+    """Returns the paper's plan and all messages of its run in one process."""
+    plan, messages = plan_of("paper", "duration=0.4", *overrides), list[Message]()
+    Engine(plan, messages.append).run()
+    return plan, messages
+
+
+def of(messages: list[Message], source: int, channel: Channel) -> list[bytes]:
+    """Returns the payloads of one source on one channel."""
+    return [encode(message) for message in messages if message.source == source and message.channel is channel]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        ("paper", "duration=0.05"),
+        ("paper", "duration=0.05", LINKS),
+        ("paper", "duration=0.6", LATE),
+        ("paper", "duration=0.4", LOST),
+        ("paper", "duration=0.06", LINKS, "formation.period=0.01", "formation.groups.g2.period=0.002"),
+        ("three_levels", "duration=0.1", "avoidance.enabled=true"),
+    ],
+    ids=lambda wanted: "-".join(wanted)[:40],
+)
+def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: int) -> None:
+    plan, digest = plan_and_digest(*wanted)
+    network = Network()
+    runners = [
+        Runner(make_role(plan, one.index), plan, network.session(one.name), RUN, watched=True, virtual=True)
+        for one in plan.formation
+    ]
+    ended: list[int] = []
+
+    def run(index: int) -> None:
+        runners[index].lockstep(lambda time_ns, sources: None)
+        with network.changed:
+            ended.append(index)
+            network.changed.notify_all()
+
+    for index in range(len(runners)):
+        threading.Thread(target=run, args=(index,), daemon=True).start()
+    network.deliver(random.Random(seed), lambda: len(ended) == len(runners))
+    builder = TraceBuilder(plan)
+    for batches in network.watched.values():
+        for batch in batches:
+            for payload in split(batch):
+                builder.add(decode(payload))
+    assert builder.build().digest() == digest
+    assert not any(runner.counts.refused or runner.mailbox.unexpected for runner in runners)
+
+
+def test_a_stall_names_whom_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(echelon.runtime.runner, "STALL_S", 0.02)
+    plan, messages = story()
+    leader = plan.nodes[1]
+    member = Member(plan, make_role(plan, leader.index))
+    states = {child: of(messages, child, Channel.STATE) for child in leader.children}
+    first, second, third = leader.children
+    for child, count in ((first, 3), (second, 2), (third, 3)):
+        for payload in states[child][:count]:
+            member.receive(payload)
+
+    def on_wait() -> None:
+        if len(member.waits) == 1:
+            for payload in of(messages, plan.root.index, Channel.REFERENCE)[:2]:
+                member.receive(payload)
+        else:
+            member.runner.stop()  # ends it at its next wait
+
+    member.on_wait = on_wait
+    member.thread.start()
+    member.join()
+    assert isinstance(member.failure, SystemExit)
+    assert member.waits == [(0, [plan.root.index]), (2 * plan.robots[0].period_ns, [second])]
+    commands = of(messages, leader.index, Channel.COMMAND)[:2]
+    groups = of(messages, leader.index, Channel.GROUP_STATE)[:2]
+    assert member.said == [payload for pair in zip(groups, commands, strict=True) for payload in pair]
+    assert member.watched() == member.said
+
+
+def test_garbage_is_counted_and_dropped() -> None:
+    plan, messages = story()
+    robot = plan.robots[0]
+    commands = of(messages, robot.parent, Channel.COMMAND)
+    member = Member(plan, make_role(plan, robot.index))
+    member.thread.start()
+    noise = random.Random(1)
+    shapeless = 0
+    for number, command in enumerate(commands):
+        other_version = bytes([command[0] + 1]) + command[1:]
+        for garbage in (b"", noise.randbytes(noise.randint(1, 90)), command[:-1], other_version):
+            member.receive(garbage)
+        member.receive(encode(Message(Channel.COMMAND, 999, number, 0, decode(command).values)))
+        if (message := decode(command)).values.size:
+            for misshapen in (message.values[:-1], np.append(message.values, 0.0)):
+                member.receive(encode(message._replace(values=misshapen)))
+                shapeless += 1
+        member.receive(command)
+        member.receive(command)  # twice is once
+    member.join()
+    assert member.failure is None
+    assert sum(member.runner.counts.refused.values()) == 5 * len(commands) + shapeless
+    assert member.runner.mailbox.unexpected == len(commands)
+    assert member.runner.mailbox.misshapen == shapeless > 0
+    assert member.said == of(messages, robot.index, Channel.STATE)
+
+
+def test_a_watcher_that_takes_nothing_holds_the_role_back_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(echelon.runtime.runner, "BATCH_BYTES", 1000)
+    plan, messages = story()
+    robot = plan.robots[0]
+    states = of(messages, robot.index, Channel.STATE)
+    member = Member(plan, make_role(plan, robot.index))
+    member.watch_gate.clear()
+    member.thread.start()
+    for command in of(messages, robot.parent, Channel.COMMAND):
+        member.receive(command)  # which waits for nobody
+    assert member.at_gate.wait(TIMEOUT_S)
+    per_batch = 1 + 1000 // len(states[0])
+    assert len(member.said) <= (MAX_BATCHES + 1) * per_batch
+    assert member.batches == []
+    member.watch_gate.set()
+    member.join()
+    assert member.said == states
+    assert member.watched() == states
+
+
+def test_the_last_batch_is_sent_though_the_handler_ends_the_run() -> None:
+    plan, messages = story()
+    robot = plan.robots[0]
+    for _ in range(20):
+        member = Member(plan, make_role(plan, robot.index))
+        member.runner.finish = lambda: None  # type: ignore[method-assign]  # lockstep alone has to do it
+        member.thread.start()
+        for command in of(messages, robot.parent, Channel.COMMAND):
+            member.receive(command)
+        member.join()
+        assert member.watched() == of(messages, robot.index, Channel.STATE)
+
+
+def test_receiving_never_waits_for_a_put_of_the_main_thread() -> None:
+    plan, messages = story()
+    robot = plan.robots[0]
+    member = Member(plan, make_role(plan, robot.index))
+    member.data_gate.clear()
+    member.thread.start()
+    assert member.at_gate.wait(TIMEOUT_S)  # the main thread puts the first state, and moves the role
+
+    def feed() -> None:
+        for command in of(messages, robot.parent, Channel.COMMAND):
+            member.receive(command)
+
+    feeder = threading.Thread(target=feed, daemon=True)
+    feeder.start()
+    feeder.join(TIMEOUT_S)
+    assert not feeder.is_alive()
+    member.data_gate.set()
+    member.join()
+    assert member.said == of(messages, robot.index, Channel.STATE)
+
+
+def test_a_role_that_hears_nothing_through_its_links_still_waits_for_its_sources(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(echelon.runtime.runner, "STALL_S", 0.02)
+    plan, messages = story(LOST)
+    robot = plan.robots[0]
+    member = Member(plan, make_role(plan, robot.index))
+    member.thread.start()
+    assert member.waiting.wait(TIMEOUT_S)
+    assert LEAD <= len(member.said) <= LEAD + 2
+    assert member.waits[0][1] == [robot.parent]
+    for command in of(messages, robot.parent, Channel.COMMAND):
+        member.receive(command)
+    member.join()
+    assert member.said == of(messages, robot.index, Channel.STATE)
+
+
+@pytest.mark.parametrize("at", [0, 30])
+def test_an_exception_in_a_stage_reaches_the_caller(at: int) -> None:
+    plan, messages = story()
+    robot = plan.robots[0]
+    role = make_role(plan, robot.index)
+
+    def spoiled(time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        if time_ns == at * robot.period_ns:
+            raise ArithmeticError("spoiled")
+        return say.run(time_ns, heard)
+
+    say, move = role.stages
+    stub: Any = SimpleNamespace(index=role.index, stages=(replace(say, run=spoiled), move))
+    member = Member(plan, stub)
+    member.thread.start()
+    for command in of(messages, robot.parent, Channel.COMMAND):
+        member.receive(command)
+    member.join()
+    assert isinstance(member.failure, ArithmeticError)
+    assert member.watched() == member.said == of(messages, robot.index, Channel.STATE)[:at]
+
+
+class Clock:
+    """Stands for the module `time`: sleeping and waiting move it, nothing else does."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def monotonic_ns(self) -> int:
+        """Returns the time."""
+        return self.now_ns
+
+
+def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int | None], Runner]:
+    """Runs a robot's stages on a wall clock with commands that come `delay_of(number)` [ns] after their instant, or
+    never; returns by instant the number of the command it used."""
+    plan, messages = story()
+    robot = plan.robots[0]
+    start_ns = 1_000_000_000
+    clock = Clock()
+    payloads = [
+        (start_ns + number * robot.period_ns + delay, payload)
+        for number, payload in enumerate(of(messages, robot.parent, Channel.COMMAND))
+        if (delay := delay_of(number)) is not None
+    ]
+    heard_numbers: list[int | None] = []
+
+    def move(time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        message = heard[0]
+        heard_numbers.append(None if message is None else message.sequence)
+        return stages[1].run(time_ns, heard)
+
+    role = make_role(plan, robot.index)
+    stages: tuple[Stage, ...] = tuple(role.stages)
+    stub: Any = SimpleNamespace(index=role.index, stages=(stages[0], replace(stages[1], run=move)))
+    coming = deque(sorted(payloads, key=lambda each: each[0]))
+
+    def rest(runner: Runner, until_ns: int) -> None:
+        """Lets time pass until something comes, which the handler takes, or to the end."""
+        if coming and coming[0][0] <= max(until_ns, clock.now_ns):
+            came_ns, payload = coming.popleft()
+            clock.now_ns = max(clock.now_ns, came_ns)
+            member.receive(payload)
+        else:
+            clock.now_ns = max(clock.now_ns, until_ns)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(echelon.runtime.runner, "time", clock)
+        patch.setattr(Runner, "_rest", rest)
+        member = Member(plan, stub, virtual=False)
+        member.runner.wall_clock(start_ns)
+    assert member.watched() == member.said
+    assert clock.now_ns >= start_ns + plan.duration_ns
+    return plan, heard_numbers, member.runner
+
+
+def test_on_a_clock_nothing_late_is_nothing_counted() -> None:
+    plan, numbers, runner = on_the_clock(lambda number: 10)
+    instants = plan.duration_ns // plan.robots[0].period_ns + 1
+    assert numbers == list(range(instants))
+    assert (runner.counts.late, runner.counts.latest_ns) == (0, 0)
+    assert runner.counts.stages == 2 * instants
+
+
+def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
+    plan = story()[0]
+    instants = plan.duration_ns // plan.robots[0].period_ns + 1
+    stopped = range(100, 120)  # its leader stands still, and then catches up
+    period_ns = plan.robots[0].period_ns
+
+    def delay_of(number: int) -> int | None:
+        if number == 50:
+            return None  # lost
+        return (stopped.stop - number) * period_ns + 10 if number in stopped else 10
+
+    _, numbers, runner = on_the_clock(delay_of)
+    wanted: list[int | None] = list(range(instants))
+    wanted[50] = 49
+    wanted[stopped.start : stopped.stop] = [stopped.start - 1] * len(stopped)
+    assert numbers == wanted
+    assert runner.counts.late == 1 + len(stopped)
+    assert runner.counts.latest_ns == 0  # it ran at its deadline, not after
+
+
+def test_keys_of_what_a_member_hears() -> None:
+    plan = story()[0]
+    heard: list[str] = []
+    session: Any = SimpleNamespace(
+        subscribe=lambda keys, receive: heard.extend(keys), publisher=lambda key: SimpleNamespace(put=lambda data: None)
+    )
+    Runner(make_role(plan, plan.nodes[1].index), plan, session, RUN, watched=False, virtual=True)
+    g1 = [data_key(RUN, plan.formation[child].path, Channel.STATE) for child in plan.nodes[1].children]
+    assert heard == sorted([*g1, data_key(RUN, "", Channel.REFERENCE)])

@@ -1,0 +1,349 @@
+"""Parts that others wrote and that fail: found before a run where that can be, and in a run named in one line, whichever way it
+runs, with all that was recorded kept and the wheels at zero."""
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import pytest
+from support.runs import SCENARIOS, echelon, start_echelon, summary_of
+
+from echelon.bridge.can.canlog import read_log
+from echelon.planning.loading import ScenarioError
+from echelon.sim.parts.loading import load, parse
+from echelon.sim.recording.mcap_reader import read_trace
+from echelon.sim.parts.time_limit import TookTooLong, time_limit
+
+LAW = """
+from echelon.controller.laws import Law
+
+class Mine(Law):
+    uses = {"gains", "lead"}
+
+    def nu(self, block, t, e, e_dot, feed_forward, state):
+        state += 1
+        LINE
+        return feed_forward - block.K_1 @ e - block.K_2 @ e_dot
+
+    def state_size(self, block):
+        return 1
+"""
+PATH = """
+import numpy as np
+from echelon.controller.trajectory import Trajectory
+
+class Mine(Trajectory):
+    def at(self, t):
+        LINE
+        return np.array([[0.1 * t, 0.0], [0.1, 0.0], [0.0, 0.0]])
+"""
+PLANT = """
+from echelon.agents.plant import Plant, paper_step
+
+class Mine(Plant):
+    def step(self, robot, state, tau_right, tau_left, h):
+        LINE
+        return paper_step(robot)(state, tau_right, tau_left, h)
+"""
+TEXTS = {"law": LAW, "path": PATH, "plant": PLANT}
+USES = {
+    "law": 'law={use="mine.py:Mine",epsilon=[0.5,0.5],lead=0.5,gains=[{k1=0.25,k2=0.5}]}',
+    "path": 'trajectory={use="mine.py:Mine"}',
+    "plant": 'formation.groups.g2.robots.r5.model="mine.py:Mine"',
+}
+HANG = "while True: pass"
+LATER = {
+    # In the 31st period, which no trial before the run asks for; a trajectory's trial asks between the ticks.
+    "law": 'if state[0] > 30 and block.name == "g2":',
+    "path": "if 0.299 < t < 0.6 and abs(100 * t - round(100 * t)) < 1e-9:",
+    "plant": "if 0.12 < state.v < 0.2:",
+}
+NAMED = {
+    "law": "mine.py:Mine of block g2: nu at t = 0.3 s ",
+    "path": "mine.py:Mine: at(0.3) ",
+    "plant": "mine.py:Mine of g2/r5: step ",
+}
+RUNS = {"law": "g2", "path": "coordinator", "plant": "g2/r5"}
+"""Who hangs"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A user's folder with a scenario."""
+    shutil.copy(SCENARIOS / "lab.toml", tmp_path / "mine.toml")
+    return tmp_path
+
+
+def write(folder: Path, kind: str, line: str) -> str:
+    """Writes a part with a line in it; returns the override that makes the scenario use it."""
+    (folder / "mine.py").write_text(TEXTS[kind].replace("LINE", line))
+    return USES[kind]
+
+
+def run(folder: Path, use: str, *arguments: str, timeout: float = 120) -> CompletedProcess[str]:
+    return echelon(
+        *("run", folder / "mine.toml", "--set", use, "--set", "duration=1.0", "--quiet"),
+        *("--no-report", "--out", folder / "run", *arguments),
+        timeout=timeout,
+    )
+
+
+def one_line(err: str) -> str:
+    """Returns what was said on standard error, which must be one line and no traceback."""
+    lines = err.strip().splitlines()
+    assert len(lines) == 1, err
+    return lines[0]
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("raise KeyError('w')", "raised KeyError: 'w'"),
+        ("raise ValueError('first\\nsecond')", "raised ValueError: first\\nsecond"),
+        ("return None", {"plant": "must return a RobotState", "path": "has the shape ()", "law": "returned nothing"}),
+        ("return [1.0]", {"plant": "must return a RobotState", "path": "has the shape (1,)", "law": "has the shape (1,)"}),
+        (HANG, "takes longer than 2 s"),
+        ("while True:\n            try:\n                pass\n            except Exception:\n                pass", "longer"),
+    ],
+    ids=["raises", "two lines", "nothing", "shape", "hangs", "hangs and swallows"],
+)  # fmt: skip
+def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
+    folder: Path, kind: str, line: str, says: str | dict[str, str]
+) -> None:
+    use = write(folder, kind, line)
+    begun = time.monotonic()
+    with pytest.raises(ScenarioError) as caught:
+        load(folder / "mine.toml", [use])
+    text = str(caught.value)
+    assert time.monotonic() - begun < 4
+    assert re.match(
+        rf"{re.escape(str(folder / 'mine.toml'))}: mine\.py:Mine(: at\(0\)| of block g1: nu| of g2/r5: step)", text
+    )
+    assert (says if isinstance(says, str) else says[kind]) in text
+    assert len(text.splitlines()) == 1
+    parse((folder / "mine.toml").read_text(), "mine.toml", [use], folder, trial=False)  # as what a run left is read
+
+
+@pytest.mark.parametrize(
+    ("kind", "line", "says"),
+    [
+        ("law", "if not e.any(): return e / abs(e).sum()", "is not finite: [nan, nan, nan, nan]"),
+        ("law", "if block.name == 'inter': return 1 / 0", "mine.py:Mine of block inter: nu at t = 0 s raised ZeroDivision"),
+        ("path", "if t > 0.9: return 1 / 0", "mine.py:Mine: at(40) raised ZeroDivisionError"),
+        ("plant", "if state.v > 0: return 1 / 0", "mine.py:Mine of g2/r5: step raised ZeroDivisionError"),
+    ],
+)  # fmt: skip
+def test_each_block_robot_and_time_is_tried(folder: Path, kind: str, line: str, says: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load(folder / "mine.toml", [write(folder, kind, line)])
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("command", ["run", "validate"])
+def test_a_mistake_found_by_trying_ends_a_command_with_2(folder: Path, command: str) -> None:
+    done = echelon(command, folder / "mine.toml", "--set", write(folder, "law", "1 / 0"))
+    assert done.returncode == 2
+    assert "mine.py:Mine of block g1: nu at t = 0 s raised ZeroDivisionError" in one_line(done.stderr)
+
+
+def test_a_file_that_never_ends_is_a_mistake_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("echelon.sim.parts.loading.LOAD_PATIENCE_S", 0.3)
+    use = write(folder, "law", "pass")
+    (folder / "mine.py").write_text("while True: pass\n")
+    with pytest.raises(ScenarioError) as caught:
+        load(folder / "mine.toml", [use])
+    assert "law.use = 'mine.py:Mine': mine.py" in str(caught.value)
+    assert "more than 0.3 s" in str(caught.value)
+
+
+PACED = ("--clock", "wall", "--set", "duration=3.0", "--set", "periods={acceleration=0.05,torque=0.01}")
+"""At a pace that a busy machine keeps, too"""
+WAYS = {
+    "in process": ("--engine", "inprocess"),
+    "in process, closed": ("--engine", "inprocess", "--set", "can.path=closed"),
+    "in process, wall clock": ("--engine", "inprocess", *PACED),
+    "processes": (),
+    "processes, closed": ("--set", "can.path=closed"),
+    "processes, wall clock": PACED,
+    "processes, wall clock, closed": (*PACED, "--set", "can.path=closed"),
+}
+
+
+def wheels_are_at_zero(folder: Path, dbc_name: str = "torque.dbc") -> None:
+    """The last torque frames of all robots in can.log want zero, drives disabled."""
+    import cantools
+
+    database = cantools.database.load_file(folder / dbc_name)
+    last: dict[str, dict[str, object]] = {}
+    for _, _, (can_id, data, _) in read_log(folder / "can.log"):
+        message = database.get_message_by_frame_id(can_id)
+        if message.name.startswith("torque_"):
+            last[message.name] = message.decode(data)
+    assert len(last) == 9
+    for name, signals in last.items():
+        assert signals["tau_right"] == signals["tau_left"] == 0, name
+        assert signals["enable_right"] == signals["enable_left"] == 0, name
+
+
+@pytest.mark.parametrize(
+    ("kind", "way"),
+    [("law", way) for way in WAYS]
+    + [
+        (kind, way)
+        for kind in ("path", "plant")
+        for way in ("in process", "processes", "processes, wall clock, closed")
+    ],
+)
+def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way: str) -> None:
+    use = write(folder, kind, f"{LATER[kind]} raise KeyError('w')")
+    done = run(folder, use, *WAYS[way])
+    assert done.returncode == 3, done.stderr
+    said = one_line(done.stderr)
+    if "wall" in way:  # a node that hears a robot too late asks nobody in that period
+        assert re.sub(r"\d\.\d+", "0.3", said) == f"echelon: {NAMED[kind]}raised KeyError: 'w'"
+    else:
+        assert said == f"echelon: {NAMED[kind]}raised KeyError: 'w'"
+    summary = summary_of(folder / "run")
+    assert not summary["verdict"]["holds"]
+    assert summary["verdict"]["reasons"][0] == said.removeprefix("echelon: ")
+    assert summary["run"]["failure"] == said.removeprefix("echelon: ")
+    assert summary["instants"] > 5
+    plan = parse((folder / "run" / "scenario.toml").read_text(), "scenario.toml", (), folder / "run")[1]
+    assert read_trace(folder / "run" / "run.mcap", plan).digest() == summary["trace_digest"]
+    assert echelon("report", folder / "run").returncode == 0
+    if "closed" in way:
+        wheels_are_at_zero(folder / "run")
+
+
+@pytest.mark.parametrize("line", ["return e[:1]", "return e * float('nan')"])
+def test_nonsense_in_a_run_is_named_too(folder: Path, line: str) -> None:
+    said = [
+        one_line(run(folder, write(folder, "law", f"{LATER['law']} {line}"), *WAYS[way]).stderr)
+        for way in ("in process", "processes")
+    ]
+    assert said[0].startswith("echelon: mine.py:Mine of block g2: nu at t = 0.3 s ")
+    assert said[0] == said[1]
+
+
+@pytest.mark.parametrize(
+    ("kind", "way"),
+    [("law", way) for way in ("in process", "in process, wall clock", "processes", "processes, closed")]
+    + [(kind, way) for kind in ("path", "plant") for way in ("in process", "processes")],
+)
+def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str) -> None:
+    use = write(folder, kind, f"{LATER[kind]}\n            {HANG}")
+    done = run(folder, use, *WAYS[way], "--stall-timeout", "5")
+    assert done.returncode == 3, done.stderr
+    said = done.stderr.strip().splitlines()[-1]  # before it, processes say whom they wait for
+    assert re.match(r"echelon: stalled for 5 s at t = [0-9.]+ s: everyone waits for ", said)
+    assert f" {RUNS[kind]}" in said
+    assert "which runs mine.py:Mine" in said
+    assert "Traceback" not in done.stderr
+    assert summary_of(folder / "run")["instants"] > 5
+    if "closed" in way:
+        wheels_are_at_zero(folder / "run")
+
+
+def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_is_named_at_the_end(folder: Path) -> None:
+    use = write(folder, "law", f"{LATER['law']}\n            {HANG}")
+    done = run(folder, use, *WAYS["processes, wall clock, closed"])
+    assert done.returncode == 3
+    assert "not done after 13 s: g2, which runs mine.py:Mine" in done.stderr
+    wheels_are_at_zero(folder / "run")
+    assert summary_of(folder / "run")["can"]["robots"]["g2/r5"]["stopped"]["no command"] > 10
+
+
+def test_a_part_that_cannot_be_made_ends_a_run_in_a_line(folder: Path) -> None:
+    """It can be made when it is tried, and not in the run."""
+    text = PLANT.replace("LINE", "pass") + (
+        "\n    def step_of(self, robot):\n        made.append(1)\n"
+        "        if len(made) > 1 or __import__('sys').argv[0] == '-c': 1 / 0\n        return super().step_of(robot)\n"
+        "\nmade = []\n"
+    )
+    (folder / "mine.py").write_text(text)
+    done = run(folder, USES["plant"], *WAYS["in process"])
+    assert done.returncode == 3
+    assert one_line(done.stderr) == "echelon: mine.py:Mine of g2/r5: step_of raised ZeroDivisionError: division by zero"
+
+
+def test_ctrl_c_in_process_still_interrupts(folder: Path) -> None:
+    use = write(folder, "law", "pass")
+    command = start_echelon(
+        *(
+            "run",
+            folder / "mine.toml",
+            "--set",
+            use,
+            "--set",
+            "duration=1000",
+            "--engine",
+            "inprocess",
+            "--can",
+            "none",
+        ),
+        *("--quiet", "--no-report", "--out", folder / "run"),
+    )
+    recording = folder / "run" / "run.mcap"
+    while not (recording.exists() and recording.stat().st_size > 200_000):
+        time.sleep(0.05)
+        assert command.poll() is None, command.communicate()
+    command.send_signal(2)
+    _, err = command.communicate(timeout=30)
+    assert command.returncode == 3
+    assert one_line(err) == "echelon: interrupted"
+
+
+def _endless() -> None:
+    while True:
+        pass
+
+
+def _deaf() -> None:
+    while True:
+        try:
+            _endless()
+        except BaseException:  # not even that keeps it
+            raise
+
+
+@pytest.mark.parametrize("code", [_endless, _deaf])
+def test_a_time_limit_ends_what_would_not_end(code: Callable[[], None]) -> None:
+    begun = time.monotonic()
+    with pytest.raises(TookTooLong, match=r"more than 0\.2 s"), time_limit(0.2):
+        code()
+    assert 0.15 < time.monotonic() - begun < 1
+
+
+def _within_an_endless_one() -> None:
+    with pytest.raises(TookTooLong, match=r"more than 0\.1 s"), time_limit(0.1):
+        _endless()
+    _endless()
+
+
+def test_limits_are_nested_and_the_outer_one_goes_on() -> None:
+    begun = time.monotonic()
+    with pytest.raises(TookTooLong, match=r"more than 0\.5 s"), time_limit(0.5):
+        _within_an_endless_one()
+    assert 0.4 < time.monotonic() - begun < 1
+    time.sleep(0.6)  # and nothing rings any more
+
+
+def test_a_limit_can_begin_anew() -> None:
+    with time_limit(0.3) as limit:
+        for _ in range(4):
+            time.sleep(0.15)
+            limit.renew()
+
+
+def test_the_summary_of_a_broken_run_fits_its_schema(folder: Path) -> None:
+    from echelon.sim.results.rendering import read_summary
+
+    run(folder, write(folder, "path", f"{LATER['path']} 1 / 0"), *WAYS["in process"])
+    summary = read_summary(folder / "run" / "summary.json")
+    assert summary.parts[0].use == "mine.py:Mine"
+    assert json.loads((folder / "run" / "summary.json").read_text())["parts"][0]["file"] == "mine.py"

@@ -1,0 +1,258 @@
+"""The closed torque path as processes, over Zenoh and a real bus: the same as in one process; and who stops whom."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from subprocess import Popen
+from typing import Any
+
+import pytest
+
+from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.timing.bus_load import frame_bits
+from echelon.bridge.can.bus_url import resolve_url
+from echelon.bridge.can.canlog import read_log
+from echelon.bridge.roles.frame_message import BRIDGE_NODE
+from echelon.bridge.protocols.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
+from echelon.sim.processes.contract import ProcessSpec
+from echelon.sim.processes.supervisor import Supervisor
+from support.runs import echelon, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, until
+
+SHORT = ("--set", "duration=0.5", "--set", "claims=[]", "--no-report", "--quiet")
+ROBOTS = 9
+SCALE = 0.001
+
+
+def test_three_protocols_on_three_buses_as_processes_are_what_one_process_computes(tmp_path: Path) -> None:
+    urls = ",".join(resolve_url("auto", number) for number in range(3))
+    many = echelon("run", "drives", *SHORT, "--can", urls, "--out", tmp_path / "many")
+    one = echelon("run", "drives", *SHORT, "--engine", "inprocess", "--out", tmp_path / "one")
+    assert (many.returncode, one.returncode) == (0, 0), many.stderr + one.stderr
+    several, single = summary_of(tmp_path / "many"), summary_of(tmp_path / "one")
+    assert several["trace_digest"] == single["trace_digest"]
+    assert (tmp_path / "many" / "can.log").read_bytes() == (tmp_path / "one" / "can.log").read_bytes()
+    assert (tmp_path / "many" / "can.log").stat().st_size > 100_000
+    assert several["can"]["foreign"] == several["can"]["drives"]["foreign"] == 0
+    for row in several["can"]["robots"].values():
+        assert (row["enabled"], row["fault"], sum(row["stopped"].values())) == (True, "", 0)
+    assert sorted(path.name for path in (tmp_path / "many").glob("*.dbc")) == [
+        "torque-can0.dbc",
+        "torque-can1.dbc",
+        "torque-can2.dbc",
+    ]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_in_any_order_of_start(tmp_path: Path, backwards: bool) -> None:
+    plan = plan_of("lab", "can.path=closed", "duration=0.3")
+
+    def order(specs: list[ProcessSpec]) -> list[ProcessSpec]:
+        return specs[::-1] if backwards else sorted(specs, key=lambda spec: spec.name)
+
+    outcome = Supervisor(
+        plan,
+        tmp_path,
+        run=f"test-{os.getpid()}-{backwards}",
+        virtual=True,
+        can_urls=(resolve_url("auto"),),
+        order=order,
+    ).run()
+    assert outcome.failure is None
+    assert outcome.trace.digest() == DIGEST_OF_ONE_PROCESS()
+
+
+def DIGEST_OF_ONE_PROCESS() -> str:  # noqa: N802
+    from support.runs import trace_of
+
+    return trace_of(plan_of("lab", "can.path=closed", "duration=0.3")).digest()
+
+
+class Listener:
+    """Hears the native frames of a run on a bus: for each robot the last torques commanded and reported, with their times."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._codec = NativeCodec(SCALE)
+        self.moving_ns = [0] * ROBOTS
+        """When a robot's drive last reported torque"""
+        self.heard_ns = [0] * ROBOTS
+        """When a robot's drive last reported"""
+        self.commands = 0
+        """Torque frames of the first robot"""
+
+    def listen(self, until_ns: int) -> None:
+        """Listens until an instant of the monotonic clock."""
+        while (left_ns := until_ns - time.monotonic_ns()) > 0:
+            received = self._bus.recv(left_ns * 1e-9)
+            now_ns = time.monotonic_ns()
+            self.commands += received is not None and received.can_id == BASE_ID
+            if received is None or not FEEDBACK_ID <= received.can_id < FEEDBACK_ID + ROBOTS:
+                continue
+            robot = received.can_id - FEEDBACK_ID
+            right, left = (int.from_bytes(received.data[at : at + 2], "little", signed=True) for at in (0, 2))
+            self.heard_ns[robot] = now_ns
+            if right or left:
+                self.moving_ns[robot] = now_ns
+
+
+@pytest.fixture
+def wall_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Listener, Path]]:
+    """A closed run in real time whose drives give torque; whatever is left of it is killed afterwards."""
+    url = resolve_url("auto")
+    folder = tmp_path / "run"
+    # Drives that a busy machine starved come back.
+    arguments = ["--clock", "wall", "--set", "can.path=closed", "--set", "robot.drive.recover_after=0.5"]
+    arguments += ["--set", "claims=[]", "--can", url, "--quiet", "--no-report"]
+    with open_bus(url) as bus:
+        command = start_echelon("run", "lab", *arguments, "--out", folder)
+        try:
+            listener = Listener(bus)
+            limit_ns = time.monotonic_ns() + 30_000_000_000
+            while not all(listener.moving_ns):
+                assert time.monotonic_ns() < limit_ns, command.poll()
+                listener.listen(time.monotonic_ns() + 100_000_000)
+            yield command, listener, folder
+        finally:
+            kill_session(command.pid)
+            command.communicate()
+
+
+HALF_A_SECOND = 500_000_000
+"""Five times the watchdog: what a busy machine may need on top of it"""
+
+
+@pytest.mark.parametrize("frozen", ["g1/r1", "g1", "coordinator", "bridge"])
+def test_who_is_frozen_lets_nobody_drive_on(wall_run: tuple[Popen[str], Listener, Path], frozen: str) -> None:
+    """Frozen and not killed: nobody sees it end, so watchdogs and ages of messages alone can tell."""
+    command, listener, _ = wall_run
+    frozen_ns = time.monotonic_ns()
+    os.kill(pid_of(frozen, session_members(command.pid)), signal.SIGSTOP)
+    listener.listen(frozen_ns + 4 * HALF_A_SECOND)
+    hit = range(3) if frozen.startswith("g1") else range(ROBOTS)
+    for robot in hit:
+        assert listener.moving_ns[robot] < frozen_ns + HALF_A_SECOND
+        assert listener.heard_ns[robot] > frozen_ns + 3 * HALF_A_SECOND  # it still says that there is none
+
+
+def test_a_bridge_that_stood_still_makes_up_for_nothing(wall_run: tuple[Popen[str], Listener, Path]) -> None:
+    command, listener, _ = wall_run
+    bridge = pid_of("bridge", session_members(command.pid))
+    os.kill(bridge, signal.SIGSTOP)
+    listener.listen(time.monotonic_ns() + 2 * HALF_A_SECOND)
+    stopped_ns, before = time.monotonic_ns(), listener.commands
+    os.kill(bridge, signal.SIGCONT)
+    listener.listen(stopped_ns + HALF_A_SECOND)
+    assert 10 < listener.commands - before < 75  # fifty periods; a hundred were missed
+    listener.listen(stopped_ns + 4 * HALF_A_SECOND)
+    assert min(listener.moving_ns) > stopped_ns + HALF_A_SECOND  # and the drives recovered
+
+
+@pytest.mark.parametrize("killed", ["g2/r5", "g3", "coordinator", "bridge", "drives"])
+def test_who_is_killed_ends_the_run_without_torque(wall_run: tuple[Popen[str], Listener, Path], killed: str) -> None:
+    command, listener, folder = wall_run
+    killed_ns = time.monotonic_ns()
+    os.kill(pid_of(killed, session_members(command.pid)), signal.SIGKILL)
+    listener.listen(killed_ns + 2 * HALF_A_SECOND)
+    assert max(listener.moving_ns) < killed_ns + HALF_A_SECOND
+    assert command.wait(30) == 3
+    assert killed in summary_of(folder)["verdict"]["reasons"][0]
+    frames = [logged.frame for logged in read_log(folder / "can.log")]
+    if killed != "bridge":  # whose last word is to disable all drives
+        codec = NativeCodec(SCALE)
+        for robot in range(ROBOTS):
+            last = [frame for frame in frames if frame.can_id == BASE_ID + robot][-1]
+            torque = codec.decode(last.can_id, last.data)
+            assert (torque.enable_right, torque.enable_left) == (False, False)  # type: ignore[union-attr]
+    assert until(lambda: not session_members(command.pid))
+
+
+def paced_run(folder: Path, *more: str) -> dict[str, Any]:
+    """Runs the lab on a wall clock on a bus that is as slow as a real one; returns what the summary says of the bus."""
+    sets = ["can.path=closed", "can.timing=bits", "duration=2.5", "claims=[]", *more]
+    arguments = [word for value in sets for word in ("--set", value)]
+    echelon("run", "lab", "--clock", "wall", "--quiet", "--no-report", "--out", folder, *arguments)
+    can: dict[str, Any] = summary_of(folder)["can"]
+    return can
+
+
+def test_on_a_wall_clock_an_overloaded_bus_is_late_and_loses(tmp_path: Path) -> None:
+    bitrate = 125_000
+    can = paced_run(tmp_path / "run", f"can.bitrate={bitrate}", "can.queue=64", "can.bring_up=0.1")
+    (bus,) = can["buses"]
+    assert bus["lost"] > 100
+    assert 0.7 < bus["load"] < 1.01
+    frames = [(frame.time_ns, frame_bits(*frame.frame)) for frame in read_log(tmp_path / "run" / "can.log")]
+    taken_ns = sum(bits for _, bits in frames[1:]) * 1_000_000_000 // bitrate
+    assert 0.7 < taken_ns / (frames[-1][0] - frames[0][0]) < 1.1  # what a process held up goes out a bit denser
+    # Commands have lower identifiers than what drives say: they are held up by themselves alone, those by all of them.
+    commands, feedback = (
+        [bus["identifiers"][f"{first + robot:03X}"] for robot in range(ROBOTS)] for first in (BASE_ID, FEEDBACK_ID)
+    )
+    assert sum(row["lost"] for row in commands) == 0
+    assert sum(row["lost"] for row in feedback) > 0
+    assert max(row["latency_max"] for row in feedback) > 2 * max(row["latency_mean"] for row in commands)
+
+
+@pytest.mark.parametrize("whose", ["bridge", "drive"])
+def test_on_a_wall_clock_errors_come_on_schedule_and_a_controller_that_is_off_comes_back(
+    tmp_path: Path, whose: str
+) -> None:
+    robot = ', robot="g1/r1"' if whose == "drive" else ""
+    events = f'events=[{{kind="error_frames", at=0.2, duration=0.3, rate=0.1}}, {{kind="bus_off", at=1.0{robot}}}]'
+    can = paced_run(tmp_path / "run", events, "robot.drive.recover_after=0.05", "can.restart=0.5")
+    (bus,) = can["buses"]
+    assert bus["destroyed"] > 20
+    node, can_id = (BRIDGE_NODE, BASE_ID) if whose == "bridge" else (1, FEEDBACK_ID)
+    off_s, back_s = (event["time"] for event in bus["events"] if event["node"] == node and event["time"] >= 1.0)
+    assert 1.0 <= off_s < 1.5
+    assert 0.5 < back_s - off_s < 0.8
+    times_s = [
+        frame.time_ns / 1e9 - 1.0 for frame in read_log(tmp_path / "run" / "can.log") if frame.frame.can_id == can_id
+    ]
+    assert not [at for at in times_s if off_s + 0.25 < at < back_s - 0.01]
+    assert [at for at in times_s if at > back_s]
+    assert can["referee"]["kinds"]  # it saw that something was missing
+
+
+@pytest.mark.parametrize("protocol", ["native", "odrive", "cia402"])
+def test_where_no_drive_answers_the_bridge_says_so_and_goes_on(tmp_path: Path, protocol: str) -> None:
+    sets = [
+        "can.path=closed",
+        "can.virtual_drives=false",
+        f"robot.drive.protocol={protocol}",
+        "duration=0.5",
+        "claims=[]",
+    ]
+    arguments = [word for value in sets for word in ("--set", value)]
+    done = echelon("run", "lab", "--clock", "wall", "--quiet", "--no-report", "--out", tmp_path / "run", *arguments)
+    assert done.returncode == 1
+    assert "lost bridge" not in done.stdout + done.stderr
+    robots = summary_of(tmp_path / "run")["can"]["robots"]
+    assert not any(row["enabled"] for row in robots.values())
+    assert "not enabled at the end: g1/r1, " in done.stdout
+
+
+@pytest.mark.parametrize("engine", ["inprocess", "processes"])
+def test_frames_that_drives_had_no_room_for_stand_with_their_identifiers(tmp_path: Path, engine: str) -> None:
+    sets = ["can.path=closed", "can.bitrate=125000", "can.queue=8", "duration=0.5", "claims=[]"]
+    arguments = [word for value in sets for word in ("--set", value)]
+    echelon("run", "lab", "--engine", engine, "--quiet", "--no-report", "--out", tmp_path / "run", *arguments)
+    can = summary_of(tmp_path / "run")["can"]
+    (bus,) = can["buses"]
+    in_drives = sum(row["lost"] for row in can["drives"]["robots"].values())
+    assert in_drives > 100
+    assert bus["lost"] >= in_drives
+    assert bus["lost"] == sum(row["lost"] for row in bus["identifiers"].values())
+    assert all(bus["identifiers"][f"{0x200 + robot:03X}"]["lost"] for robot in range(ROBOTS))
+
+
+@pytest.mark.parametrize("command", ["run", "drives"])
+@pytest.mark.parametrize("event", ['kind="error_frames", rate=0.1', 'kind="bus_off", robot="g1/r1"'])
+def test_disturbances_need_a_bus_that_is_a_model(command: str, event: str) -> None:
+    clock = ["--clock", "wall"] if command == "run" else ["--seconds", "1"]
+    events = f"events=[{{{event}, at=0.1}}]"
+    done = echelon(command, "lab", *clock, "--set", "can.path=closed", "--set", events)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "takes its own time" in done.stderr

@@ -1,0 +1,292 @@
+"""A run's processes come up together, give what one process gives, and go down together, however they end."""
+
+import os
+import re
+import resource
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from multiprocessing import Process
+from pathlib import Path
+from subprocess import Popen
+
+import pytest
+from support.runs import descendants, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, trace_of, until
+
+from echelon.plan.plan import Plan
+from echelon.sim.processes.contract import ProcessSpec
+from echelon.sim.parts.loading import parse
+from echelon.sim.recording.mcap_reader import read_trace, recover
+from echelon.sim.processes.supervisor import NAMED, Outcome, Progress, Supervisor, few
+
+LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
+LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0},{channel="reference",loss=1.0}]'
+SHORT = "duration=0.3"
+TWENTY = """
+name = "twenty"
+duration = 1000.0
+robot = {{ mass = 4.0, inertia = 0.12, wheel_radius = 0.05, arm = 0.15, offset = 0.1 }}
+law = {{ epsilon = [0.5] }}
+trajectory = {{ kind = "line", velocity = [0.1, 0.0] }}
+formation.shape = {{ kind = "line", spacing = 1.0 }}
+formation.robots = {{ {robots} }}
+"""
+
+
+def supervised(plan: Plan, folder: Path, **options: object) -> Outcome:
+    """Runs a plan as processes."""
+    return Supervisor(plan, folder, run=f"test-{os.getpid()}-{id(plan)}", virtual=True, **options).run()  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def long_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Path]]:
+    """A run that would take minutes, once it is recording; whatever is left of it is killed afterwards."""
+    folder = tmp_path / "run"
+    command = start_echelon("run", "paper", "--set", "duration=1000", "--can", "virtual", "--quiet", "--out", folder)
+    try:
+        recording = folder / "run.mcap"
+        assert until(lambda: recording.exists() and recording.stat().st_size > 200_000), command.communicate(timeout=5)
+        yield command, folder
+    finally:
+        kill_session(command.pid)
+        command.communicate()
+
+
+def finished(command: Popen[str]) -> tuple[int, str, str]:
+    """Waits for the end of a run; all its processes must be gone by then, or in the moment after."""
+    out, err = command.communicate(timeout=30)
+    assert until(lambda: not session_members(command.pid), 5), session_members(command.pid)
+    return command.returncode, out, err
+
+
+@pytest.mark.parametrize("links", [(), (LINKS,), (LATE, "duration=2")], ids=["ideal", "delay and loss", "very late"])
+def test_processes_give_the_trace_of_one_process(tmp_path: Path, links: tuple[str, ...]) -> None:
+    plan = plan_of("paper", SHORT, *links)
+    expected = trace_of(plan).digest()
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == expected
+    assert read_trace(tmp_path / "run.mcap", plan).digest() == expected
+
+
+def test_order_of_start_does_not_matter(tmp_path: Path) -> None:
+    plan = plan_of("paper", SHORT, LINKS)
+    outcome = supervised(plan, tmp_path, order=lambda specs: specs[::-1])
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def _spin() -> None:
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    while True:
+        pass
+
+
+def test_a_busy_core_does_not_matter(tmp_path: Path) -> None:
+    plan = plan_of("paper", SHORT, LINKS)
+    busy = Process(target=_spin, daemon=True)
+    busy.start()
+    try:
+        outcome = supervised(plan, tmp_path)
+    finally:
+        busy.kill()
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+@pytest.mark.parametrize("scenario", ["unequal", "three_levels", "multi", "integral", "sliding"])
+def test_every_tree_gives_the_trace_of_one_process(tmp_path: Path, scenario: str) -> None:
+    plan = plan_of(scenario, "duration=0.4", "avoidance.enabled=true")
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def test_layers_with_periods_of_their_own(tmp_path: Path) -> None:
+    plan = plan_of("paper", SHORT, "formation.period=0.01", "formation.groups.g2.period=0.002", LINKS)
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def test_two_runs_at_once_never_meet(tmp_path: Path) -> None:
+    plans = [plan_of("paper", "duration=0.5", f"seed={seed}", LINKS) for seed in (1, 2)]
+    commands = [
+        start_echelon(
+            *("run", "paper", "--set", "duration=0.5", "--set", f"seed={seed}", "--set", LINKS),
+            *("--can", "none", "--no-report", "--quiet", "--out", tmp_path / str(seed)),
+        )
+        for seed in (1, 2)
+    ]
+    for command in commands:
+        finished(command)
+    digests = [summary_of(tmp_path / str(seed))["trace_digest"] for seed in (1, 2)]
+    assert digests == [trace_of(plan).digest() for plan in plans]
+    assert digests[0] != digests[1]
+
+
+def test_wall_clock_gives_the_same_when_nothing_is_late(tmp_path: Path) -> None:
+    plan = plan_of("lab", "duration=0.5", "periods.acceleration=0.05", "periods.torque=0.01")
+    outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
+    assert outcome.failure is None
+    runners = [result.runner for result in outcome.processes if result.runner]
+    assert len(runners) == 13
+    if not sum(runner.late for runner in runners):
+        assert outcome.trace.digest() == trace_of(plan).digest()
+    assert outcome.wall_s >= 0.5
+
+
+def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:
+    command, folder = long_run
+    os.kill(pid_of("g2/r5", session_members(command.pid)), signal.SIGKILL)
+    code, _, err = finished(command)
+    assert code == 3
+    assert "lost robot g2/r5 (killed by SIGKILL)" in err
+    summary = summary_of(folder)
+    assert not summary["verdict"]["holds"]
+    assert "g2/r5" in summary["verdict"]["reasons"][0]
+    assert len(read_trace(folder / "run.mcap", plan_of("paper", "duration=1000")).times_ns[0]) > 10
+
+
+def test_last_words_of_a_process_that_fails(tmp_path: Path) -> None:
+    def spoil(specs: list[ProcessSpec]) -> list[ProcessSpec]:
+        return [replace(spec, index=999) if spec.name == "g3" else spec for spec in specs]
+
+    outcome = supervised(plan_of("paper", SHORT), tmp_path, order=spoil)
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("lost leader g3 (exit code 1)")
+    assert "IndexError" in outcome.failure
+
+
+def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None:
+    folder, notes = tmp_path, []
+    stopped: list[int] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns and not stopped:
+            stopped.append(pid_of("g2/r5", descendants(os.getpid())))
+            os.kill(stopped[0], signal.SIGSTOP)
+        if progress.note and progress.note not in notes:
+            notes.append(progress.note)
+
+    outcome = supervised(plan_of("paper", "duration=1000"), folder, show=watch, stall_timeout_s=5.0)
+    assert any("everyone waits for g2/r5" in note and "stopped" in note for note in notes), notes
+    assert outcome.failure is not None
+    assert outcome.failure.startswith("stalled")
+    assert not Path(f"/proc/{stopped[0]}").exists()
+
+
+@pytest.mark.parametrize("name", ["recorder", "bridge", "g1"])
+def test_a_process_that_stands_still_for_a_while_costs_only_time(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("echelon.sim.processes.supervisor.STALL_REPORT_S", 2.2)
+    plan, notes = plan_of("paper", "duration=3", LINKS), []
+    stopped: list[int] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns and not stopped:
+            stopped.append(pid_of(name, descendants(os.getpid())))
+            os.kill(stopped[0], signal.SIGSTOP)
+        if progress.note and progress.note not in notes:
+            notes.append(progress.note)
+            if f"for {name}" in progress.note and "stopped" in progress.note:
+                os.kill(stopped[0], signal.SIGCONT)
+
+    outcome = supervised(plan, tmp_path, show=watch, can_urls=("virtual",))
+    assert outcome.failure is None, notes
+    assert any(f"for {name}" in note for note in notes)
+    assert outcome.trace.digest() == trace_of(plan).digest()
+    assert outcome.can.frames == 9 * 3000
+
+
+def test_ctrl_c_during_start_up_ends_without_a_traceback(tmp_path: Path) -> None:
+    options = ("--set", "duration=1000", "--can", "none", "--quiet", "--no-report", "--out", tmp_path / "run")
+    command = start_echelon("run", "paper", *options)
+    try:
+        assert until(lambda: len(session_members(command.pid)) > 2)  # the fork server is just importing
+        os.killpg(command.pid, signal.SIGINT)
+        code, out, err = finished(command)
+    finally:
+        kill_session(command.pid)
+    assert code in (3, -signal.SIGINT)  # the latter if an import was interrupted: Python tells its caller so
+    assert err.splitlines()[-1] == "echelon: interrupted"
+    assert "Traceback" not in out + err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_keeps_what_it_recorded(long_run: tuple[Popen[str], Path], number: int) -> None:
+    command, folder = long_run
+    os.kill(command.pid, number)
+    code, _, err = finished(command)
+    assert code == 3
+    assert "interrupted" in err
+    trace = read_trace(folder / "run.mcap", plan_of("paper", "duration=1000"))
+    assert trace.digest() == summary_of(folder)["trace_digest"]
+
+
+def test_ctrl_c_in_a_terminal_reaches_everyone_and_ends_well(long_run: tuple[Popen[str], Path]) -> None:
+    command, folder = long_run
+    os.killpg(command.pid, signal.SIGINT)
+    code, _, err = finished(command)
+    assert code == 3
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert summary_of(folder)["instants"] > 10
+
+
+def test_nothing_outlives_a_killed_supervisor(long_run: tuple[Popen[str], Path], tmp_path: Path) -> None:
+    command, folder = long_run
+    assert len(session_members(command.pid)) >= 16
+    os.kill(command.pid, signal.SIGKILL)
+    command.wait()
+    assert until(lambda: not session_members(command.pid), 5), session_members(command.pid)
+    result = recover(folder / "run.mcap", tmp_path / "mended.mcap")
+    assert result.messages > 1000
+
+
+def test_full_disk_ends_the_run_and_says_so(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))  # inherited by all processes of the run
+    try:
+        command = start_echelon(
+            *("run", "paper", "--set", "duration=1000", "--can", "none", "--no-report", "--quiet"),
+            *("--out", tmp_path / "run"),
+        )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    code, _, err = finished(command)
+    assert code == 3
+    assert "the recording failed" in err
+    assert recover(tmp_path / "run" / "run.mcap", tmp_path / "mended.mcap").messages > 1000
+
+
+def test_a_note_names_a_dozen_processes_at_most() -> None:
+    names = [f"r{number}" for number in range(127)]
+    assert few(names[:3]) == "r0, r1, r2"
+    assert few(names[:NAMED]) == ", ".join(names[:12])
+    assert few(names, "; ") == "; ".join([*names[:12], "and 115 more"])
+
+
+def test_a_run_of_many_that_stalls_says_so_in_a_short_line(tmp_path: Path) -> None:
+    """Twenty robots stop, and their leader waits for all of them."""
+    robots = ", ".join(f"r{number} = {{ start = [{number}.0, 0.0] }}" for number in range(20))
+    text = TWENTY.format(robots=robots)
+    plan = parse(text, "t.toml")[1]
+    notes: list[str] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.note:
+            notes.append(progress.note)
+        elif progress.messages > 200:
+            for pid in stoppable():
+                os.kill(pid, signal.SIGSTOP)
+
+    def stoppable() -> list[int]:
+        named = {pid: Path(f"/proc/{pid}/comm").read_text().strip() for pid in descendants(os.getpid())}
+        return [pid for pid, name in named.items() if re.fullmatch(r"r\d+", name)]
+
+    outcome = supervised(plan, tmp_path, show=watch, stall_timeout_s=5.0)
+    (note,) = {note for note in notes if note.startswith("stalled")}
+    assert note.count("(process ") == NAMED
+    assert note.endswith(", and 8 more")
+    assert outcome.failure is not None
+    assert len(outcome.failure.splitlines()[0]) < 800

@@ -1,0 +1,338 @@
+"""Summaries against closed forms: exponential decay, straight passes, counted periods."""
+
+import json
+from math import exp, log, sqrt
+
+import numpy as np
+import pytest
+from support.synthetic import DECAY, FIELD, at_places, can_report, decaying, link_counts, of_states, run_facts, with_states
+
+from echelon.bridge.reports import BusEvent, BusReport, FindingReport, RefereeReport, ScheduledEvent
+from echelon.sim.results.can_lines import can_lines, can_reasons
+from echelon.sim.results.distances import distances
+from echelon.sim.results.measures import settling_ns
+from echelon.sim.results.records import Summary
+from echelon.sim.results.rendering import json_text, read_summary, write_summary
+from echelon.sim.results.summary import summarise, summary_text
+from echelon.sim.results.trace import Trace
+
+NO_CLAIMS = "claims=[]"
+MS = 1_000_000
+
+
+def record_of(trace: Trace) -> Summary:
+    return summarise(trace, [], None, run_facts())
+
+
+def strict(summary: Summary) -> dict:
+    """Returns a summary as a strict reader of JSON gets it."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(json_text(summary), parse_constant=refuse)
+
+
+def summary_of(trace: Trace) -> dict:
+    return strict(record_of(trace))
+
+
+@pytest.fixture(scope="module")
+def run():
+    return decaying()
+
+
+@pytest.fixture(scope="module")
+def record(run) -> Summary:
+    return summarise(run.trace, link_counts(run.plan), can_report(), run_facts())
+
+
+@pytest.fixture(scope="module")
+def summary(record) -> dict:
+    return strict(record)
+
+
+def test_settling_is_the_first_instant_inside_the_band(run, summary):
+    for row in summary["blocks"]:
+        for key, fraction in (("settling_2", 0.02), ("settling_5", 0.05)):
+            exact = DECAY[row["layer"]] * log(1 / fraction)
+            assert 0 <= row[key] - exact < 0.001, (row["name"], key)
+
+
+def test_integrals_have_their_closed_forms(run, summary):
+    end = 12.0
+    for row in summary["blocks"]:
+        decay, norm = DECAY[row["layer"]], float(np.linalg.norm(run.start[row["name"]]))
+        left = exp(-end / decay)
+        tolerance = 5 * (0.001 / decay) ** 2  # the trapezoidal rule's error
+        assert row["ise"] == pytest.approx(norm**2 * decay / 2 * (1 - left**2), rel=tolerance)
+        assert row["iae"] == pytest.approx(norm * decay * (1 - left), rel=tolerance)
+        assert row["itae"] == pytest.approx(norm * decay**2 * (1 - (1 + end / decay) * left), rel=tolerance)
+        assert row["residual"] == pytest.approx(norm * left, abs=1e-12)
+        assert (row["peak_error"], row["peak_time"]) == (pytest.approx(norm), 0.0)
+
+
+def test_layers_are_separated_by_the_ratio_of_their_decays(summary):
+    assert [(row["faster"], row["slower"]) for row in summary["separation"]] == [
+        ("intra", "inter"),
+        ("inter", "centroid"),
+    ]
+    for row in summary["separation"]:
+        assert row["sigma_ratio"] == pytest.approx(10)
+        assert row["settling_2_ratio"] == pytest.approx(10, rel=0.02)
+        assert row["settling_5_ratio"] == pytest.approx(10, rel=0.02)
+
+
+def test_scales_of_their_own_are_compared_one_by_one():
+    run = decaying(["duration=2.0", 'law.time_scales="multi"', "law.epsilon=[0.5, 0.5, 0.5, 0.5]", NO_CLAIMS])
+    rows = summary_of(run.trace)["separation"]
+    assert [row["faster"] for row in rows] == ["g1", "g2", "g3", "inter"]
+    assert rows[0]["settling_5_ratio"] == 1.0
+    assert rows[-1]["settling_5_ratio"] is None  # the centroid does not settle in 2 s
+
+
+@pytest.mark.parametrize(
+    ("norm", "settled"),
+    [
+        ([1.0, 0.04, 0.04], MS),
+        ([1.0, 0.05, 0.05], MS),  # on the band is inside
+        ([1.0, 0.04, 0.06, 0.04], 3 * MS),  # it leaves once more
+        ([1.0, 0.04, 0.06], None),
+        ([0.0, 0.0], 0),
+        ([1e-10, 0.9e-10], 0),  # rounding
+        ([0.01, 1.0, 0.01], 2 * MS),  # of the largest, not of the first
+        ([1.0, np.nan, 0.0], None),
+        ([np.inf, 0.0], None),
+        ([], None),
+    ],
+)
+def test_settling_of_a_few_samples(norm, settled):
+    assert settling_ns(np.arange(len(norm)) * MS, np.array(norm), 0.05) == settled
+
+
+def test_claims_that_hold_make_a_verdict_that_holds(summary):
+    assert [claim["holds"] for claim in summary["claims"]] == [True] * 3
+    assert summary["claims"][0]["blocks"].keys() == {"g1", "g2", "g3"}
+    assert summary["verdict"] == {"holds": True, "reasons": []}
+    assert summary["simulated"] == 12.0
+    assert summary["largest_gap"] == 0.001
+
+
+def test_a_claim_is_held_against_its_slowest_block_and_its_own_band():
+    late = summary_of(decaying(['claims=[{block="*", settled_by=6.0}, {block="inter", settled_by=6.0}]']).trace)
+    assert [claim["holds"] for claim in late["claims"]] == [True, True]
+    early = summary_of(
+        decaying(['claims=[{block="*", settled_by=5.9}, {block="g2", settled_by=0.06, band=0.02}]']).trace
+    )
+    assert [claim["holds"] for claim in early["claims"]] == [False, False]
+    assert early["claims"][0]["measured"] == early["claims"][0]["blocks"]["centroid"] == 5.992
+    assert not early["verdict"]["holds"]
+    just = summary_of(decaying(['claims=[{block="*", settled_by=5.992}]']).trace)
+    assert just["verdict"]["holds"]
+    assert "5.992" in early["verdict"]["reasons"][0]
+
+
+def passing(offset: float, speed: float, steps: int, period_ns: int = 100 * MS) -> Trace:
+    """Robot 0 passes robot 1, which stands in the origin, along x; the middle of its way is its closest point."""
+    along = (np.arange(steps) - (steps - 1) / 2) * speed * period_ns / 1e9
+    moving = np.stack([along, np.full(steps, offset)], axis=1)
+    return at_places(np.stack([moving, np.zeros((steps, 2))], axis=1), [NO_CLAIMS], period_ns)
+
+
+def test_a_pass_between_two_instants_is_seen():
+    near = distances(passing(offset=0.3, speed=20.0, steps=2))
+    assert near.closest.pair == (0, 1)
+    assert near.closest.distance == pytest.approx(0.3)
+    assert near.closest.time_ns == 50 * MS
+    assert near.smallest == pytest.approx([0.3, sqrt(1 + 0.09)])
+    (violation,) = near.violations
+    half = sqrt(0.5**2 - 0.3**2) / 20.0  # r_a is 0.5 m
+    assert violation.first_ns == pytest.approx(50 * MS - half * 1e9, abs=1)
+    assert violation.last_ns == pytest.approx(50 * MS + half * 1e9, abs=1)
+    assert violation.smallest == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("steps", [2, 3, 10, 81])
+def test_a_violation_is_one_interval_however_many_instants_it_spans(steps):
+    near = distances(passing(offset=0.3, speed=40.0 / (steps - 1), steps=steps))
+    (violation,) = near.violations
+    assert (violation.last_ns - violation.first_ns) / 1e9 * 40.0 / (steps - 1) == pytest.approx(0.8, rel=1e-6)
+    assert violation.smallest == pytest.approx(0.3, rel=1e-12)
+
+
+def test_leaving_and_coming_back_are_two_violations_even_in_adjacent_segments():
+    x = np.array([2.0, -2.0, 2.0])
+    places = np.stack([np.stack([x, np.full(3, 0.3)], axis=1), np.zeros((3, 2))], axis=1)
+    near = distances(at_places(places, [NO_CLAIMS]))
+    assert len(near.violations) == 2
+    assert near.violations[0].last_ns < MS < near.violations[1].first_ns
+
+
+def test_the_radius_itself_is_a_violation_and_what_begins_or_ends_inside_has_its_ends():
+    places = np.array([[[0.5, 0.0], [0.0, 0.0]]] * 3)
+    (violation,) = distances(at_places(places, [NO_CLAIMS])).violations
+    assert (violation.first_ns, violation.last_ns, violation.smallest) == (0, 2 * MS, 0.5)
+    places[:, 0, 0] = np.nextafter(0.5, 1)
+    assert distances(at_places(places, [NO_CLAIMS])).violations == ()
+
+
+def test_a_single_instant_has_distances():
+    near = distances(at_places(np.array([[[0.4, 0.0], [0.0, 0.0]]]), [NO_CLAIMS]))
+    assert near.smallest.tolist() == [0.4]
+    assert [(v.first_ns, v.last_ns) for v in near.violations] == [(0, 0)]
+
+
+def test_closest_approach_agrees_with_dense_interpolation():
+    generator = np.random.default_rng(7)
+    places = generator.normal(scale=3.0, size=(30, 4, 2)).cumsum(axis=0)
+    near = distances(at_places(places, [NO_CLAIMS]))
+    share = np.linspace(0, 1, 2001)[:, None, None, None]
+    dense = places[:-1] + share * (places[1:] - places[:-1])
+    gaps = np.linalg.norm(dense[:, :, :, None] - dense[:, :, None], axis=-1)
+    gaps[:, :, *np.tril_indices(4)] = np.inf
+    brute = gaps.min(axis=(0, 2, 3))
+    assert (near.smallest[:-1] <= brute + 1e-12).all()
+    np.testing.assert_allclose(near.smallest[:-1], brute, atol=0.02)
+    assert near.closest.distance == near.smallest.min()
+    radius = 0.5
+    inside = {(i, j) for i in range(4) for j in range(i + 1, 4) if gaps[:, :, i, j].min() <= radius}
+    assert {violation.pair for violation in near.violations} >= inside
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_violations_fail_the_verdict_where_robots_avoid_each_other(enabled):
+    places = np.zeros((12_001, 2, 2))
+    places[:, 0, 0] = np.linspace(-3, 3, 12_001)
+    summary = summary_of(at_places(places, [NO_CLAIMS, f"avoidance.enabled={str(enabled).lower()}"]))
+    assert summary["distance"]["pair"] == ["g1/r2", "g1/r1"]
+    assert summary["distance"]["smallest"] == pytest.approx(0, abs=1e-12)
+    (violation,) = summary["distance"]["violations"]
+    assert (violation["first"], violation["last"]) == pytest.approx((5.0, 7.0), abs=1e-8)
+    assert summary["verdict"]["holds"] is not enabled
+
+
+def test_torques_are_measured_over_the_periods(run):
+    states = [part.copy() for part in run.trace.states]
+    robot = states[4]
+    robot[0, FIELD["tau_right_square"]] = 1e9  # the start has no period behind it
+    robot[1:, FIELD["tau_right_square"]] = 16.0
+    robot[1:, FIELD["tau_left_square"]] = np.where(np.arange(12_000) % 2, 0.0, 4.0)
+    robot[1:, FIELD["tau_right_peak"]] = 5.0
+    robot[3000, FIELD["tau_left_peak"]] = 9.0
+    robot[500:502, FIELD["saturated"]] = 10  # ten inner periods each: at 0.5 s
+    robot[1000, FIELD["saturated"]] = 3  # ends at the first second
+    robot[1001, FIELD["saturated"]] = 4
+    row = summary_of(with_states(run.trace, states))["torque"][4]
+    assert row["robot"] == "g2/r5"
+    assert (row["rms_right"], row["rms_left"]) == pytest.approx((4.0, sqrt(2)))
+    assert row["rms"] == pytest.approx(3.0)
+    assert (row["peak"], row["peak_wheel"], row["peak_time"]) == (9.0, "left", 3.0)
+    assert row["saturation_share"] == pytest.approx(27 / 120_000)
+    assert row["saturated_after_first_second"] == 4
+    assert row["torque_limit"] is None  # there is none
+
+
+def test_links_and_what_is_passed_in_are_fit_for_json(run, summary):
+    first, second = summary["links"][:2]
+    assert first["source"] == run.plan.formation[run.plan.links[0].source].name
+    assert first["sent"] == first["delivered"] + first["lost"] + first["in_flight"]
+    assert (first["age_mean"], first["age_max"]) == (0.00250000025, 0.006)
+    assert second["held"] == 0
+    assert (summary["can"]["frames"], summary["can"]["load_mean"], summary["can"]["timing"]) == (12, 0.25, None)
+    assert summary["run"]["real_time_factor"] == 2.0
+    assert summary["trace_digest"] == run.trace.digest()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("field", ["x", "theta", "tau_left_square", "saturated"])
+def test_a_state_that_is_not_finite_fails_and_stays_valid_json(run, value, field):
+    states = [part.copy() for part in run.trace.states]
+    states[2][40:, FIELD[field]] = value
+    record = record_of(with_states(run.trace, states))
+    summary = strict(record)
+    assert not summary["verdict"]["holds"]
+    assert summary["verdict"]["reasons"][0] == "g1/r3: a state is not finite from 0.04 s on"
+    assert "not finite" in summary_text(record)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_run_that_explodes_but_stays_finite_fails_its_claims(run):
+    _, states = run.trace.common()
+    states = states * np.exp(np.linspace(0, 700, len(states)))[:, None, None]
+    assert np.isfinite(states).all()
+    record = record_of(of_states(run.plan, run.trace.times_ns[0], states))
+    summary = strict(record)
+    assert [claim["holds"] for claim in summary["claims"]] == [False] * 3
+    assert [claim["measured"] for claim in summary["claims"]] == [None] * 3
+    assert summary["blocks"][0]["ise"] is None
+    assert "did not settle" in summary_text(record)
+
+
+def test_a_run_that_ended_early_fails(run):
+    cut = [len(times) for times in run.trace.times_ns]
+    assert shortened(run.trace, [length - 1 for length in cut]).verdict.holds  # without its last instant
+    for lengths, words in (
+        ([length - 2 for length in cut], "every robot ended early"),
+        ([cut[0] - 5000, *cut[1:]], "g1/r2 at 7 s of 12 s"),
+        ([*cut[:-1], 0], "g3/r9 before it began"),
+        ([0] * len(cut), "every robot ended early, the first g1/r2 before it began"),
+    ):
+        record = shortened(run.trace, lengths)
+        summary = strict(record)
+        assert not summary["verdict"]["holds"]
+        assert words in " ".join(summary["verdict"]["reasons"])
+        assert "FAILS" in summary_text(record)
+
+
+def shortened(trace: Trace, lengths: list[int]) -> Summary:
+    pairs = zip(trace.times_ns, trace.states, lengths, strict=True)
+    times, states = zip(*((times[:n], states[:n]) for times, states, n in pairs), strict=True)
+    return record_of(Trace(trace.plan, times, states))
+
+
+def test_what_is_written_reads_back_as_the_same_record(record, tmp_path):
+    write_summary(record, tmp_path / "summary.json")
+    assert read_summary(tmp_path / "summary.json") == record
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: text[:100], "Invalid JSON"),
+        (lambda text: "", "Invalid JSON"),
+        (lambda text: "[]", "Input should be an object"),
+        (lambda text: text.replace('"seed": 1', '"seed": "one"'), "seed: "),
+        (lambda text: text.replace('"holds"', '"holdz"', 1), "verdict.holds: Field required"),
+    ],
+)
+def test_a_damaged_summary_is_one_line(record, tmp_path, change, says):
+    path = tmp_path / "summary.json"
+    path.write_text(change(json_text(record)), encoding="utf-8")
+    with pytest.raises(ValueError, match="is no summary that can be read") as caught:
+        read_summary(path)
+    assert says in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_the_text_says_what_matters(record, summary):
+    text = summary_text(record)
+    assert text.startswith("paper: HOLDS")
+    for words in ("intra within 5 % by 0.1 s: 0.06 s, holds", "2 lost", "0.006 s", "2 times real time"):
+        assert words in text
+    assert summary["trace_digest"] in text
+
+
+def test_what_was_on_schedule_and_who_went_bus_off_is_told():
+    buses = (
+        BusReport("can0", 500_000, 0.1, lost=3, destroyed=2, events=(BusEvent(2.5, 0, "bridge", "bus-off"),)),
+        BusReport("can1", 500_000, 0.1, lost=1, events=(BusEvent(2.6, 0, "bridge", "recovered"),)),
+    )
+    scheduled = (ScheduledEvent(2.0, None, "estop", ("g1/r1",)),)
+    finding = FindingReport(2.5, "can0", "100", "gap", "late", "g1/r1")
+    referee = RefereeReport(7, 0, {"gap": 1}, (finding,), {})
+    can = can_report(frames=7, path="closed", buses=buses, scheduled=scheduled, referee=referee)
+    lines = [" ".join(line.split()) for line in can_lines(can)]
+    assert lines[0].startswith("CAN 7 frames, 4 lost, 2 destroyed and sent again")
+    assert lines[1:3] == ["events 2 s estop", "bus-off bridge at 2.5 s"]
+    assert can_reasons(can) == ["referee: 1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"]

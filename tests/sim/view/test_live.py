@@ -1,0 +1,100 @@
+"""What a person sees of a run: lines where there is no terminal, a table where there is one."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from support.runs import plan_of
+
+from echelon.bridge.reports import BridgeProgress
+from echelon.controller.trajectory import make_trajectory
+from echelon.controller.transformation import Transformation
+from echelon.messages import STATE_FIELDS
+from echelon.sim.view import live
+from echelon.sim.view.live import Display
+from echelon.sim.processes.supervisor import Progress
+
+PLAN = plan_of("paper")
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        """It is."""
+        return True
+
+
+def progress_with(errors: dict[str, float], time_ns: int = 2_000_000_000) -> Progress:
+    """Returns the progress of a run whose blocks have errors of these norms [m]."""
+    cbt = Transformation(PLAN)
+    shape = cbt.desired(make_trajectory(PLAN.trajectory).at(time_ns * 1e-9)[0]).copy()
+    flat = shape.reshape(-1)
+    for block in PLAN.blocks:
+        flat[block.offset] += errors.get(block.name, 0.0)
+    states = np.zeros((len(PLAN.robots), len(STATE_FIELDS)))
+    states[:, :2] = cbt.backward(flat.reshape(shape.shape))
+    return Progress("running", time_ns, time_ns, states, 1234, 1.0, BridgeProgress("virtual:x", 0.25, 12))
+
+
+def test_errors_of_blocks() -> None:
+    wanted = {"g1": 0.5, "inter": 0.25, "centroid": 3.0}
+    errors = Display(PLAN, io.StringIO()).errors(progress_with(wanted))
+    assert list(errors) == [block.name for block in PLAN.blocks]
+    assert errors == pytest.approx({name: wanted.get(name, 0.0) for name in errors}, abs=1e-12)
+    assert Display(PLAN, io.StringIO()).errors(Progress()) == {}
+
+
+def test_errors_of_a_diverged_run_are_no_error() -> None:
+    progress = progress_with({})
+    progress.states[:] = np.inf
+    assert not np.isfinite(list(Display(PLAN, io.StringIO()).errors(progress).values())).any()
+
+
+def test_plain_lines_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    display = Display(PLAN, stream)
+    for _ in range(50):  # ten seconds
+        display.show(progress_with({"g1": 0.5}))
+        now[0] += 0.2
+    display.close()
+    lines = stream.getvalue().splitlines()
+    assert 4 <= len(lines) <= 5
+    assert all("t 2.00 of 12 s" in line and "g1 0.5 m" in line and "CAN load 25 %" in line for line in lines)
+    assert "\x1b" not in stream.getvalue()
+
+
+def test_a_note_is_told_once_and_at_once() -> None:
+    stream = io.StringIO()
+    display = Display(PLAN, stream, quiet=True)
+    for note in ("stalled", "stalled", "goes on", "goes on"):
+        display.show(Progress(note=note))
+    assert stream.getvalue().splitlines() == ["stalled", "goes on"]
+
+
+def test_a_table_in_a_terminal() -> None:
+    stream = Terminal()
+    display = Display(PLAN, stream)
+    display.say("heading [not markup]")
+    display.show(progress_with({"centroid": 3.0}))
+    display.close()
+    display.close()
+    text = stream.getvalue()
+    assert "\x1b" in text
+    assert "heading [not markup]" in text
+    assert "virtual:x" in text
+    assert "centroid" in text
+    display.say("after")
+    assert stream.getvalue().endswith("after\n")
+
+
+def test_quiet_in_a_terminal_leaves_it_alone() -> None:
+    stream = Terminal()
+    display = Display(PLAN, stream, quiet=True)
+    display.show(progress_with({}))
+    display.close()
+    assert stream.getvalue() == ""

@@ -1,0 +1,123 @@
+"""Runs for tests: small scenarios, and the command line as a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from echelon.plan.plan import Plan
+from echelon.sim.engines.in_process import Engine
+from echelon.sim.parts.loading import load
+from echelon.sim.results.trace import Trace, TraceBuilder
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENARIOS = ROOT / "deploy" / "scenarios"
+EXAMPLES = ROOT / "examples"
+
+
+def plan_of(name: str, *overrides: str) -> Plan:
+    """Returns the plan of a shipped scenario with overrides."""
+    return load(SCENARIOS / f"{name}.toml", overrides)[1]
+
+
+def trace_of(plan: Plan) -> Trace:
+    """Returns the trace of a plan run in this process."""
+    builder = TraceBuilder(plan)
+    Engine(plan, builder.add).run()
+    return builder.build()
+
+
+def echelon(
+    *arguments: str | Path, timeout: float = 120, cwd: Path = ROOT, typed: str = "", **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Runs the command line to its end; `typed` is what it finds on standard input."""
+    command = [sys.executable, "-m", "echelon", *map(str, arguments)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=timeout, cwd=cwd, input=typed, check=False, **options
+    )
+
+
+def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
+    """Starts the command line in a session of its own, so that all its processes can be found."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "echelon", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # where tests run in the background it is ignored
+    )
+
+
+def _alive() -> list[tuple[int, int, int]]:
+    """Returns process, parent and session of all that are alive, zombies not counted."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if fields[0] != "Z":
+                found.append((int(entry.name), int(fields[1]), int(fields[3])))
+    return found
+
+
+def lab_dbc(torque_scale: float = 0.001) -> str:
+    """Returns the DBC of lab.toml's robots, g1/r1 to g3/r9, with native drives."""
+    from echelon.bridge.protocols.plan_dbc import plan_dbc
+
+    return plan_dbc(plan_of("lab", f"can.torque_scale={torque_scale!r}"))
+
+
+def session_members(session: int) -> list[int]:
+    """Returns the processes of a session that are alive."""
+    return [pid for pid, _, of in _alive() if of == session]
+
+
+def descendants(ancestor: int) -> list[int]:
+    """Returns the processes that come from one, over any number of generations."""
+    alive, found = _alive(), [ancestor]
+    for one in found:
+        found += [pid for pid, parent, _ in alive if parent == one]
+    return found[1:]
+
+
+def pid_of(name: str, processes: list[int]) -> int:
+    """Returns the one of some processes that bears a name."""
+    (pid,) = [pid for pid in processes if Path(f"/proc/{pid}/comm").read_text().strip() == name]
+    return pid
+
+
+def until(condition: Any, timeout_s: float = 20.0) -> bool:
+    """Waits until a condition of other processes holds; False if it never does.  There is no event to wait for."""
+    import time
+
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """Reads a run's summary."""
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return summary
+
+
+def kill_session(session: int) -> None:
+    """Ends whatever a failed test left behind."""
+    for pid in session_members(session):
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass

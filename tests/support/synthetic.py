@@ -1,0 +1,120 @@
+"""A run whose every number is known: the paper's plan with errors that decay exponentially, each layer at its rate."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echelon.bridge.reports import BusReport, CanReport
+from echelon.controller.trajectory import make_trajectory, sample
+from echelon.controller.transformation import Transformation
+from echelon.runtime.link import LinkCounts
+from echelon.messages import STATE_FIELDS
+from echelon.plan.plan import Plan
+from echelon.scenario.tables import Scenario
+from echelon.sim.parts.loading import load
+from echelon.sim.results.records import RunFacts
+from echelon.sim.results.trace import Trace
+
+PAPER = Path(__file__).parent.parent / "deploy" / "scenarios" / "paper.toml"
+DECAY = {"intra": 0.02, "inter": 0.2, "centroid": 2.0}
+"""Time constants [s] of a layer's error"""
+PINNED = (
+    "duration=12.0",
+    "periods={acceleration=0.001, torque=0.0001}",
+    "avoidance={enabled=false, avoidance_radius=0.5, sensing_radius=3.0}",
+    "can.bitrate=1_000_000",
+    'claims=[{block="intra", settled_by=0.1}, {block="inter", settled_by=1.0}, {block="centroid", settled_by=10.0}]',
+)
+"""What the tests count on, whatever the shipped scenario says"""
+FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
+PERIOD_NS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A synthetic run and the errors e(0) of its blocks, by name."""
+
+    scenario: Scenario
+    trace: Trace
+    start: dict[str, NDArray[np.float64]]
+
+    @property
+    def plan(self) -> Plan:
+        """The run's plan."""
+        return self.trace.plan
+
+
+def decaying(overrides: Sequence[str] = (), times_ns: NDArray[np.int64] | None = None) -> Run:
+    """Returns a run with e_b(t) = e_b(0) exp(-t/decay): positions, velocities, headings; all torques zero."""
+    scenario, plan = load(PAPER, [*PINNED, *overrides])
+    if times_ns is None:
+        times_ns = np.arange(0, plan.duration_ns + 1, PERIOD_NS)
+    seconds = times_ns / 1e9
+    transformation = Transformation(plan)
+    reference = sample(make_trajectory(plan.trajectory), seconds)
+    z = transformation.desired(reference[:, 0]).reshape(len(seconds), -1)
+    rate = np.zeros_like(z)
+    rate[:, -2:] = reference[:, 1]
+    start = {}
+    for number, block in enumerate(plan.blocks, start=1):
+        at = slice(block.offset, block.offset + block.size)
+        start[block.name] = np.linspace(0.3 * number, 0.5 * number, block.size)
+        decay = DECAY[block.layer]
+        error = start[block.name] * np.exp(-seconds / decay)[:, None]
+        z[:, at] += error
+        rate[:, at] -= error / decay
+    shape = (len(seconds), len(plan.robots), 2)
+    states = np.zeros((*shape[:2], len(STATE_FIELDS)))
+    states[:, :, [FIELD["x"], FIELD["y"]]] = transformation.backward(z.reshape(shape))
+    states[:, :, [FIELD["vx"], FIELD["vy"]]] = transformation.backward(rate.reshape(shape))
+    states[:, :, FIELD["theta"]] = np.linspace(0, 1, shape[1])
+    return Run(scenario, of_states(plan, times_ns, states), start)
+
+
+def at_places(places: NDArray[np.float64], overrides: Sequence[str] = (), period_ns: int = PERIOD_NS) -> Trace:
+    """Returns a trace of the first robots standing at places (T, K, 2), all others far from them and each other."""
+    _, plan = load(PAPER, [*PINNED, *overrides])
+    states = np.zeros((len(places), len(plan.robots), len(STATE_FIELDS)))
+    states[:, :, FIELD["x"]] = 1e4 * (1 + np.arange(len(plan.robots)))
+    states[:, : places.shape[1], [FIELD["x"], FIELD["y"]]] = places
+    return of_states(plan, np.arange(len(places)) * period_ns, states)
+
+
+def of_states(plan: Plan, times_ns: NDArray[np.int64], states: NDArray[np.float64]) -> Trace:
+    """Returns the trace of states (T, robots, fields) at the same instants for all."""
+    robots = range(states.shape[1])
+    return Trace(plan, tuple(times_ns for _ in robots), tuple(np.ascontiguousarray(states[:, r]) for r in robots))
+
+
+def with_states(trace: Trace, states: Sequence[NDArray[np.float64]]) -> Trace:
+    """Returns a trace with other states at the same instants."""
+    return Trace(trace.plan, trace.times_ns, tuple(states))
+
+
+def link_counts(plan: Plan) -> list[LinkCounts]:
+    """Returns counts for all links of a plan, the first lossy and late, the others ideal."""
+    ideal = [LinkCounts(link.source, link.receiver, link.channel, 10, 10, 0, 0, 10, 0, 0.0, 0) for link in plan.links]
+    first = plan.links[0]
+    ideal[0] = LinkCounts(first.source, first.receiver, first.channel, 10, 7, 2, 1, 9, 3, 2_500_000.25, 6_000_000)
+    return ideal
+
+
+def run_facts(**given: Any) -> RunFacts:
+    """Returns how a run was run, with what is given instead."""
+    facts = RunFacts("inprocess", "virtual", 6.0, 0.0, 2.0, 200.0, 0, None)
+    return replace(facts, **given)
+
+
+def can_report(**given: Any) -> CanReport:
+    """Returns the report of a bus on which nothing happened, with what is given instead."""
+    bus = BusReport("can0", 500_000, 0.25)
+    report = CanReport(
+        path="mirror", timing=None, url="virtual", listen="", torque_scale=0.001, log_start=0.0, frames=12, load_mean=0.25,
+        fit=("can0 fits",), advice=(), buses=(bus,), scheduled=(), sent=12, failed=0, dropped=0, log_lost=0, log_error=None,
+        robots={},
+    )  # fmt: skip
+    return replace(report, **given)

@@ -1,0 +1,127 @@
+"""Invented plans: trees of any depth with matrix gains and couplings, all numbers from one seed."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.random import Generator
+
+from echelon.plan.layout import sized
+from echelon.scenario.part_fields import PartContext
+from echelon.plan.plan import Plan
+from echelon.planning.plan_maker import make_plan
+from echelon.scenario.tables import Scenario
+from echelon.sim.parts.loading import REGISTRY
+
+Tree = Sequence[Any]
+"""Children of a node: None is a robot, a sequence a group"""
+ROBOT = {"mass": 10.0, "inertia": 0.5, "wheel_radius": 0.1, "arm": 0.4, "offset": 0.2}
+PAPER_TREE: Tree = ((None,) * 3,) * 3
+
+
+def trees(max_depth: int = 4, max_children: int = 4, max_robots: int = 14) -> st.SearchStrategy[Tree]:
+    """Trees of 1 to `max_depth` layers of nodes, 1 to `max_children` children each, robots and groups mixed."""
+
+    def node(depth: int) -> st.SearchStrategy[Tree]:
+        child: st.SearchStrategy[Any] = st.none()
+        if depth > 1:
+            child = st.one_of(st.none(), node(depth - 1))
+        return st.lists(child, min_size=1, max_size=max_children).map(tuple)
+
+    return node(max_depth).filter(lambda tree: count_robots(tree) <= max_robots)
+
+
+def count_robots(tree: Tree) -> int:
+    """Returns how many robots a tree has."""
+    return sum(1 if child is None else count_robots(child) for child in tree)
+
+
+def count_nodes(tree: Tree) -> int:
+    """Returns how many nodes a tree has."""
+    return 1 + sum(count_nodes(child) for child in tree if child is not None)
+
+
+def count_layers(tree: Tree) -> int:
+    """Returns how many layers of nodes a tree has."""
+    return 1 + max((count_layers(child) for child in tree if child is not None), default=0)
+
+
+def group_table(tree: Tree, random: Generator, spread: float = 10.0) -> dict[str, Any]:
+    """Returns the scenario's table of a group: robots first, then groups, anywhere within `spread` [m]."""
+    table: dict[str, Any] = {"robots": {}, "groups": {}}
+    if len(tree) > 1:
+        table["shape"] = {"kind": "points", "points": random.normal(size=(len(tree), 2), scale=3.0).tolist()}
+    for at, child in enumerate(tree):
+        if child is None:
+            start = random.uniform(-spread / 2, spread / 2, 2).tolist()
+            table["robots"][f"r{at}"] = {"start": start, "heading": random.uniform(-3, 3)}
+        else:
+            table["groups"][f"g{at}"] = group_table(child, random, spread)
+    return table
+
+
+def scenario(tree: Tree, random: Generator, **tables: Any) -> dict[str, Any]:
+    """Returns a scenario of a tree; `tables` replace or add top-level keys."""
+    return {
+        "name": "invented",
+        "duration": 0.003,
+        "periods": {"acceleration": 0.001, "torque": 0.001},
+        "robot": ROBOT,
+        "formation": group_table(tree, random),
+        "trajectory": {"kind": "sine", "speed": 1.0, "amplitude": 30.0, "rate": 0.1},
+        "law": {"epsilon": [0.5] * count_layers(tree)},
+    } | tables
+
+
+def plan_of(table: dict[str, Any]) -> Plan:
+    """Returns the plan of a scenario's table."""
+    return make_plan(Scenario.model_validate(table, context=PartContext(REGISTRY, Path())), REGISTRY)
+
+
+def random_law(tree: Tree, random: Generator, time_scales: str = "three", coupling: float = 0.5) -> dict[str, Any]:
+    """Returns a law for a tree of two layers as a file has it: every block with full gains, every pair with K̄."""
+    law = random_epsilon(tree, random, time_scales)
+    bare = plan_of(scenario(tree, random, law=law))
+    law["gains"] = [
+        {"block": block.name, "k1": near_unit(block.size, random), "k2": near_unit(block.size, random)}
+        for block in bare.blocks
+    ]
+    law["coupling"] = [
+        {
+            "block": one.name,
+            "onto": other.name,
+            "value": random.normal(size=(one.size, other.size), scale=coupling).tolist(),
+        }
+        for one in bare.blocks
+        for other in bare.blocks
+        if one is not other and coupling
+    ]
+    return law
+
+
+def with_random_gains(plan: Plan, random: Generator, coupling: float = 0.5) -> Plan:
+    """Returns a plan with full gain matrices of its own for every block, and K̄ full but for its diagonal blocks."""
+    size = 2 * len(plan.robots)
+    k_bar = coupling * random.normal(size=(size, size))
+    blocks = []
+    for block in plan.blocks:
+        rows = slice(block.offset, block.offset + block.size)
+        k_bar[rows, rows] = 0.0
+        k1, k2 = (np.array(near_unit(block.size, random)).reshape(block.size, block.size) for _ in range(2))
+        blocks.append(replace(block, k1=k1, k2=k2))
+    return sized(replace(plan, blocks=tuple(blocks), coupling=k_bar))
+
+
+def random_epsilon(tree: Tree, random: Generator, time_scales: str = "three") -> dict[str, Any]:
+    """Returns a law of time scales that are not far apart."""
+    count = count_layers(tree) if time_scales == "three" else count_nodes(tree)
+    return {"time_scales": time_scales, "epsilon": random.uniform(0.6, 1.0, count).tolist()}
+
+
+def near_unit(size: int, random: Generator) -> list[list[float]]:
+    """Returns a full matrix not far from the unit matrix."""
+    rows: list[list[float]] = (np.eye(size) + 0.2 * random.normal(size=(size, size))).tolist()
+    return rows

@@ -12,8 +12,8 @@ import numpy as np
 
 from echelon.agents.plant import LOST, make_step, state_at
 from echelon.agents.torque import TorqueLimits, make_inverse
-from echelon.plan.layout import acceleration_of
 from echelon.messages import Channel, Heard, Message
+from echelon.plan.layout import acceleration_of
 from echelon.plan.plan import Plan
 from echelon.role import Input, Stage
 from echelon.runtime.turns import Turn

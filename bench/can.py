@@ -22,12 +22,12 @@ import numpy as np
 from bench.product import Row, table
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.can.bus_url import resolve_url
-from echelon.bridge.roles.commander import RobotChannel
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.registry import drive_places, make_drive
-from echelon.planning.loading import effective_toml
+from echelon.bridge.roles.commander import RobotChannel
 from echelon.messages import TORQUE_FIELDS, Channel, Message
 from echelon.plan.plan import Plan
+from echelon.planning.loading import effective_toml
 from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load

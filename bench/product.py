@@ -10,10 +10,10 @@ from echelon.bridge.can.bus_url import resolve_url
 from echelon.planning.loading import effective_toml
 from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
-from echelon.sim.view.live import Display
 from echelon.sim.parts.loading import load
-from echelon.sim.run import execute
 from echelon.sim.processes.supervisor import Supervisor
+from echelon.sim.run import execute
+from echelon.sim.view.live import Display
 
 
 @dataclass(frozen=True, slots=True)

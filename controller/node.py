@@ -23,8 +23,8 @@ from echelon.controller.laws.in_tree import BlockGains, NodeBlocks
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import desired_shape, node_matrix
-from echelon.plan.layout import CENTROID, NodeLayout
 from echelon.messages import NULL, Channel, Heard, Message, Values
+from echelon.plan.layout import CENTROID, NodeLayout
 from echelon.plan.plan import Array, NodePlan, Plan
 from echelon.role import Input, Stage
 from echelon.runtime.turns import Turn

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from echelon.bridge.protocols.protocol import DriveProtocol
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
+    from echelon.sim.finished_run import Run
     from echelon.sim.notebook import Loaded, load, open_run, run
-    from echelon.sim.results.run import Run
-    from echelon.sim.engines.simulation import Simulation
+    from echelon.sim.simulation import Simulation
 
 __version__ = "0.1.0"
 __all__ = [
@@ -53,11 +53,11 @@ def __getattr__(name: str) -> Any:
 
             found = {"Loaded": Loaded, "load": load, "open_run": open_run, "run": run}
         case "Run":
-            from echelon.sim.results.run import Run
+            from echelon.sim.finished_run import Run
 
             found = {"Run": Run}
         case "Simulation":
-            from echelon.sim.engines.simulation import Simulation
+            from echelon.sim.simulation import Simulation
 
             found = {"Simulation": Simulation}
         case "Plant":

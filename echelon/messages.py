@@ -32,7 +32,7 @@ class Channel(IntEnum):
     COMMAND = 4
     """Group leader to its robots: an acceleration (x, y) per child."""
     FRAMES = 5
-    """Bridge and drives to each other and to those who watch: CAN frames with their times (bridge.roles.frame_message)."""
+    """Bridge and drives to each other and to those who watch: CAN frames with their times (bridge.frame_message)."""
     TORQUE = 6
     """Robot to bridge, on the closed torque path: `TORQUE_FIELDS`.  The drives take the speeds of their shafts from it."""
     WHEELS = 7

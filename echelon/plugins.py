@@ -13,7 +13,7 @@ the same code, whatever happens to the file meanwhile, and no folder is added to
 
 import hashlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
@@ -22,13 +22,34 @@ from types import ModuleType
 from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-
-from echelon.planning.explain import PartError
+from pydantic_core import ErrorDetails
 
 T_co = TypeVar("T_co", covariant=True)
 
 GROUPS: Final = ("laws", "plants", "trajectories", "protocols")
 """The kinds of parts; `echelon.<group>` is the group of their entry points."""
+
+
+class PartError(ValueError):
+    """A scenario names a part (echelon.plugins) that cannot be had, or gives it wrong parameters.
+
+    `keys` lead from the part's place in the scenario to what is wrong.  `errors` are those of pydantic, if it is a parameter of
+    `model`; otherwise `text` says what is wrong with the value `shown`."""
+
+    def __init__(
+        self,
+        text: str,
+        keys: tuple[str, ...] = (),
+        shown: Any = None,
+        errors: Sequence[ErrorDetails] = (),
+        model: type[BaseModel] | None = None,
+    ) -> None:
+        super().__init__(text)
+        self.text, self.keys, self.shown, self.errors, self.model = text, keys, shown, errors, model
+
+    def at(self, *keys: str, shown: Any = None) -> "PartError":
+        """Returns the same mistake at other keys."""
+        return PartError(self.text, keys, shown, self.errors, self.model)
 
 
 class Plugin(BaseModel):

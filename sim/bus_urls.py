@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
-from echelon.plan.can_plan import DISTURBANCES
 from echelon.errors import UsageError
+from echelon.plan.can_plan import DISTURBANCES
 from echelon.plan.plan import Plan
 
 

@@ -4,7 +4,7 @@ import csv
 from pathlib import Path
 
 from echelon.errors import UsageError
-from echelon.sim.results.run import Run
+from echelon.sim.finished_run import Run
 from echelon.sim.results.tables import Table
 
 

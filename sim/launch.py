@@ -9,10 +9,10 @@ from echelon.errors import UsageError, UserError
 from echelon.plan.plan import Plan
 from echelon.scenario.tables import Scenario
 from echelon.sim.bus_urls import bus_urls, check_wall_clock
+from echelon.sim.finished_run import Run
 from echelon.sim.processes.children import warm_up
-from echelon.sim.view.live import Display
-from echelon.sim.results.run import Run
 from echelon.sim.run import execute, new_folder
+from echelon.sim.view.live import Display
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,14 +7,14 @@ from typing import Any, Literal, NamedTuple
 import tomlkit
 
 from echelon.errors import UserError
-from echelon.planning.loading import effective_toml
 from echelon.plan.plan import Plan
+from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
 from echelon.shipped import scenario_path
 from echelon.sim import run_folder
-from echelon.sim.parts.loading import loading as parts
+from echelon.sim.finished_run import Run
 from echelon.sim.launch import Launch, launch
-from echelon.sim.results.run import Run
+from echelon.sim.parts import loading as parts
 
 
 class Loaded(NamedTuple):

@@ -24,27 +24,27 @@ from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import PartRunError
-from echelon.planning.loading import effective_toml
 from echelon.messages import Message
 from echelon.plan.plan import Plan
+from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
 from echelon.sim.engines.in_process import Engine
+from echelon.sim.kept_parts import keep_parts
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
-from echelon.sim.parts.kept_parts import keep_parts
-from echelon.sim.view.live import Display
+from echelon.sim.parts.time_limit import TookTooLong
+from echelon.sim.processes.supervisor import Outcome, Progress, Supervisor
+from echelon.sim.processes.watchers import RunRecorder
+from echelon.sim.recording.time_order import TimeOrder, speakers
 from echelon.sim.results.records import ProcessResult, RunFacts, Summary
 from echelon.sim.results.rendering import write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
-from echelon.sim.processes.supervisor import Outcome, Progress, Supervisor
-from echelon.sim.parts.time_limit import TookTooLong
-from echelon.sim.recording.time_order import TimeOrder, speakers
-from echelon.sim.recording.watchers import RunRecorder
+from echelon.sim.view.live import Display
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
 CUT: Final = "run.mcap.cut"
-"""The recording of a run that was killed, once it has been mended (echelon.sim.recording.recovery)."""
+"""The recording of a run that was killed, once it has been mended (echelon.sim.recovery)."""
 FILES: Final = ("scenario.toml", "run.mcap", CUT, "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
 

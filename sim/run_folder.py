@@ -9,12 +9,12 @@ from echelon.bridge.referee.referee import read_run_log
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
+from echelon.sim.finished_run import Run
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import CutError, read_trace
 from echelon.sim.report.report import RunForReport, write_report
 from echelon.sim.results.frames import FrameDecoder, frame_data
 from echelon.sim.results.rendering import read_summary
-from echelon.sim.results.run import Run
 
 FRAMES: Final = 18
 """So many frames a report shows, from run time 0 on."""

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from support.runs import ROOT, summary_of
 
 from echelon.sim.parts.loading import load
+from support.runs import ROOT, summary_of
 
 EXAMPLES = ROOT / "examples"
 COMMAND = Path(sys.executable).parent / "echelon"

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import SCENARIOS
 
 import echelon.planning.loading
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.trajectory import make_trajectory
 from echelon.errors import PartRunError
-from echelon.planning.loading import ScenarioError
 from echelon.plan.plan import Plan
+from echelon.planning.loading import ScenarioError
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import REGISTRY, load
+from support.runs import SCENARIOS
 
 SPIRAL = """
 from math import cos, sin

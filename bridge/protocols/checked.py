@@ -168,7 +168,9 @@ class CheckedDrive:
         self.motors = self._caller.call("drive", lambda: tuple(self._drive.motors))
         count = len(protocol.wheels[number])
         if len(self.motors) != count or not all(isinstance(motor, Motor) for motor in self.motors):
-            raise self._caller.wrong(f"drive: motors must be {count} bridge.protocols.motor.Motor, not {self.motors!r:.60}")
+            raise self._caller.wrong(
+                f"drive: motors must be {count} bridge.protocols.motor.Motor, not {self.motors!r:.60}"
+            )
 
     @property
     def due_ns(self) -> int:

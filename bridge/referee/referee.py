@@ -14,8 +14,8 @@ What protocols ask for, their observers check (bridge.<protocol>.observe).  The 
     torque before the run
                   commanded or reported while drives are brought up, at negative times
 
-When frames are due tells bridge.referee.deadlines: waiting for the bus is not being late, neither while drives are brought up.  For the
-same reason feedback may be as old as the stretch of frames that it came in.
+`bridge.referee.deadlines` says when frames are due.  A frame that waits for the bus is not late, and no frame is late while
+drives are brought up.  For the same reason feedback may be as old as the stretch of frames that it came in.
 
 Identifiers that no robot of the plan uses are foreign traffic, which is legal: counted, not judged.  Where the torque path
 is not closed there are torques alone, one per acceleration period, and nobody answers.
@@ -27,12 +27,12 @@ from pathlib import Path
 from typing import Final
 
 from echelon.bridge.can.canlog import read_log
-from echelon.bridge.referee.deadlines import Lane
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.observe import Finding, Observer
 from echelon.bridge.protocols.registry import protocol_of, shared_cyclic
-from echelon.bridge.reports import FindingReport, RefereeReport
+from echelon.bridge.referee.deadlines import Lane
 from echelon.bridge.referee.wheel_check import WheelCheck
+from echelon.bridge.reports import FindingReport, RefereeReport
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 

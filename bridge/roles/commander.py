@@ -14,17 +14,17 @@ from typing import Final
 
 import numpy as np
 
-from echelon.bridge.timing.bus_load import worst_case_bits
-from echelon.bridge.timing.bus_model import BusEventKind
-from echelon.bridge.timing.arbitration import BusTime
-from echelon.bridge.timing.buses import make_buses
-from echelon.bridge.timing.disturbances import Disturbances
-from echelon.bridge.roles.envelope import Envelope
+from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
 from echelon.bridge.protocols.frame import Frame, Host
-from echelon.bridge.roles.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
-from echelon.bridge.timing.ideal_bus import IdealBus
 from echelon.bridge.protocols.registry import drive_places, make_host, make_masters
 from echelon.bridge.reports import WheelsReport
+from echelon.bridge.roles.envelope import Envelope
+from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.bus_load import worst_case_bits
+from echelon.bridge.timing.bus_model import BusEventKind
+from echelon.bridge.timing.buses import make_buses
+from echelon.bridge.timing.disturbances import Disturbances
+from echelon.bridge.timing.ideal_bus import IdealBus
 from echelon.bridge.timing.schedule import Schedule
 from echelon.errors import PartRunError
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message

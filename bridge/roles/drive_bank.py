@@ -9,15 +9,15 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
-from echelon.bridge.timing.buses import lost_report
+from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
 from echelon.bridge.protocols.frame import Drive, Frame
-from echelon.bridge.roles.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
 from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.registry import DrivePlace, drive_places, make_drive
 from echelon.bridge.reports import DriveReport, DrivesReport
+from echelon.bridge.timing.buses import lost_report
 from echelon.bridge.timing.schedule import Schedule
-from echelon.plan.can_plan import NEVER_NS
 from echelon.messages import TORQUE_FIELDS, Channel, Heard, Message
+from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 from echelon.role import Input, Stage
 from echelon.runtime.turns import Turn

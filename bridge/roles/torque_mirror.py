@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from echelon.bridge.timing.bus_load import BitCount
-from echelon.bridge.roles.envelope import Envelope
 from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.reports import WheelsReport
+from echelon.bridge.roles.envelope import Envelope
+from echelon.bridge.timing.bus_load import BitCount
 from echelon.plan.can_plan import EnvelopePlan
 
 

@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
-from echelon.bridge.roles.commander import Commander
 from echelon.bridge.reports import BridgeProgress, CanReport
+from echelon.bridge.roles.commander import Commander
 from echelon.messages import Message
 from echelon.plan.plan import Plan
 

@@ -7,15 +7,15 @@ from typing import Final
 
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.can.bus_url import listen_command
-from echelon.bridge.timing.buses import bus_report, scheduled
 from echelon.bridge.can.canlog import CanLog
-from echelon.bridge.roles.commander import Commander
-from echelon.bridge.timing.fit import plan_fit
-from echelon.bridge.roles.frame_message import TimedFrame, frames_of
+from echelon.bridge.frame_message import TimedFrame, frames_of
 from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.reports import BridgeProgress, CanReport, WheelsReport, stopped_text
+from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.rail import Rail, on_bus
+from echelon.bridge.timing.buses import bus_report, scheduled
+from echelon.bridge.timing.fit import plan_fit
 from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan

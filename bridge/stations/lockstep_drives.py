@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from echelon.bridge.can.bus import open_bus
-from echelon.bridge.roles.drive_bank import DriveBank
 from echelon.bridge.reports import BridgeProgress, DrivesReport
+from echelon.bridge.roles.drive_bank import DriveBank
 from echelon.bridge.stations.rail import Rail, on_bus
 from echelon.plan.plan import Plan
 from echelon.role import Stage

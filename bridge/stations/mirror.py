@@ -8,17 +8,17 @@ from typing import Final
 import numpy as np
 
 from echelon.bridge.can.bus import open_bus
-from echelon.bridge.timing.bus_load import bus_load
 from echelon.bridge.can.bus_url import listen_command
-from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.can.canlog import CanLog
-from echelon.bridge.timing.fit import plan_fit
-from echelon.bridge.roles.frame_message import BRIDGE_NODE, add_words
+from echelon.bridge.frame_message import BRIDGE_NODE, add_words
 from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.protocols.registry import make_host
 from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped_text
-from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.roles.torque_mirror import TorqueMirror
+from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.timing.bus_load import bus_load
+from echelon.bridge.timing.buses import scheduled
+from echelon.bridge.timing.fit import plan_fit
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan.plan import Plan
 

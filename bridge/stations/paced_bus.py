@@ -1,15 +1,15 @@
 """A bus on a wall clock that is as fast as a real one: frames wait in a model of it, and go out when they are over there.
 
-A virtual interface carries any number of frames at once.  Here each process has a model of the bus (bridge.timing.arbitration) with
-its own frames in it, and those it heard of others; it puts a frame on the interface at the end of the time that the frame
-takes in the model.  So all together send no more than the bit rate allows, by priority as far as one can know of the
-others; what finds no room is lost; error frames and bus-off happen in the model.  With an ideal bus for a model,
-frames go out at once: a real bus takes its own time.
-"""
+A virtual interface carries any number of frames at once.  Here each process has a model of the bus
+(bridge.timing.arbitration) with its own frames in it, and those it heard of others; it puts a frame on the interface at the
+end of the time that the frame takes in the model.
+So all together send no more than the bit rate allows, by priority as far as one can know of the others; what finds no
+room is lost; error frames and bus-off happen in the model. With an ideal bus for a model, frames go out at once: a real
+bus takes its own time."""
 
 from echelon.bridge.can.bus import Bus
-from echelon.bridge.timing.bus_model import BusEventKind, BusModel, Delivered
 from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.timing.bus_model import BusEventKind, BusModel, Delivered
 
 
 class PacedBus:

@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import Final
 
 from echelon.bridge.can.bus import Bus
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, frames_of
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import BRIDGE_NODE, TimedFrame, frames_of
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 

@@ -14,18 +14,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from echelon.bridge.timing.bus_load import BitCount
-from echelon.bridge.roles.commander import Commander
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, pack
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import BRIDGE_NODE, TimedFrame, pack
-from echelon.bridge.stations.paced_bus import PacedBus
 from echelon.bridge.reports import BridgeProgress, CanReport, TorqueTimes
+from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.closed import ClosedBridge
+from echelon.bridge.stations.paced_bus import PacedBus
 from echelon.bridge.stations.waiting import Mail, RunClock, drained
-from echelon.runtime.link import Link
+from echelon.bridge.timing.bus_load import BitCount
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan, on_wall_clock
+from echelon.runtime.link import Link
 from echelon.runtime.wire import count_refusal, encode, join
 
 FEEDBACK_SHARE: Final = 8

@@ -5,15 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 from echelon.bridge.can.bus import Bus
+from echelon.bridge.frame_message import TimedFrame
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.reports import BusReport, DrivesReport
+from echelon.bridge.roles.drive_bank import DriveBank
+from echelon.bridge.stations.paced_bus import PacedBus
+from echelon.bridge.stations.waiting import RunClock, drained, wait_for
 from echelon.bridge.timing.buses import bus_report, make_buses
 from echelon.bridge.timing.disturbances import Disturbances
-from echelon.bridge.roles.drive_bank import DriveBank
 from echelon.bridge.timing.fit import plan_fit
-from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import TimedFrame
-from echelon.bridge.stations.paced_bus import PacedBus
-from echelon.bridge.reports import BusReport, DrivesReport
-from echelon.bridge.stations.waiting import RunClock, drained, wait_for
 from echelon.plan.plan import Plan, on_wall_clock
 
 

@@ -5,8 +5,8 @@ remote frame with the same identifier the data frame.  It takes the bits that `f
 last bit of its end of frame, and blocks the bus for three bits more.  A bit lasts 1/bitrate, the frame is rounded up to
 whole nanoseconds.
 
-Errors.  An attempt to send is destroyed with a given probability, at a bit that is drawn (bridge.timing.error_draws); then follow the
-error flag, its echo, the delimiter and the interframe space, and the frame waits again.
+Errors.  An attempt to send is destroyed with a given probability, at a bit that is drawn (bridge.timing.error_draws).  Then
+follow the error flag, its echo, the delimiter and the interframe space, and the frame waits again.
 
 Error counters (ISO 11898-1, what a bus with one error at a time needs): the sender of a destroyed frame counts 8, each
 other node 1; each delivered frame takes 1 from its sender and from the receivers.  Over 127 a node is error passive and
@@ -26,10 +26,10 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
+from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.timing.bus_load import frame_bits
 from echelon.bridge.timing.bus_model import BusEvent, BusEventKind, BusModel, Delivered, Traffic
 from echelon.bridge.timing.error_draws import INTERFRAME, ErrorDraws
-from echelon.bridge.protocols.frame import Frame
 
 CAPACITY = 64
 """Frames that a node holds unless told otherwise (SocketCAN's own default is 10)"""

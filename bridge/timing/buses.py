@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-from echelon.bridge.timing.bus_model import BusModel, Traffic
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.frame_message import BRIDGE_NODE
 from echelon.bridge.protocols.frame import WHEELS
-from echelon.bridge.roles.frame_message import BRIDGE_NODE
-from echelon.bridge.timing.ideal_bus import IdealBus
 from echelon.bridge.protocols.registry import DrivePlace, drive_places
 from echelon.bridge.reports import EVENTS, BusEvent, BusReport, IdentifierReport, ScheduledEvent
+from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.bus_model import BusModel, Traffic
+from echelon.bridge.timing.ideal_bus import IdealBus
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 

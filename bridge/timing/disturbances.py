@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from echelon.bridge.timing.bus_model import BusModel
-from echelon.bridge.roles.frame_message import BRIDGE_NODE
+from echelon.bridge.frame_message import BRIDGE_NODE
 from echelon.bridge.protocols.registry import drive_places
+from echelon.bridge.timing.bus_model import BusModel
 from echelon.bridge.timing.schedule import Schedule
 from echelon.plan.can_plan import DISTURBANCES, NEVER_NS
 from echelon.plan.plan import Plan

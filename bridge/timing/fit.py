@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.bridge.protocols.registry import cyclic_of, dbc_messages, make_observer, shared_cyclic, shared_messages
+from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.bridge.timing.response_time import Stream, advice, fits, load, response_times
 from echelon.plan.plan import Plan
 

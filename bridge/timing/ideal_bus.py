@@ -3,9 +3,9 @@
 from collections import defaultdict
 from collections.abc import Mapping
 
+from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.timing.bus_load import check_frame
 from echelon.bridge.timing.bus_model import BusEvent, BusModel, Delivered, Traffic
-from echelon.bridge.protocols.frame import Frame
 
 _EVER = -(2**62)
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from math import cos, hypot, sin
 from typing import Final
 
-from echelon.planning.plan_maker import shapes
 from echelon.bridge.timing.fit import bus_fit
 from echelon.errors import UsageError
+from echelon.planning import shapes
 from echelon.planning.loading import ScenarioError
 from echelon.planning.members import MAX_ROBOTS
 from echelon.planning.shapes import Point

@@ -100,7 +100,7 @@ def recover(options: RecoverOptions) -> int:
 
 
 def _recover_folder(options: RecoverOptions) -> int:
-    from echelon.sim.recording.recovery import recover_run
+    from echelon.sim.recovery import recover_run
 
     if options.out is not None:
         raise UsageError(f"--out {options.out}: the folder of a run is mended in place; --out is for a file")

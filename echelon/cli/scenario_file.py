@@ -4,8 +4,8 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from echelon.planning.loading import ScenarioError
 from echelon.plan.plan import Plan
+from echelon.planning.loading import ScenarioError
 from echelon.scenario.tables import Scenario
 from echelon.shipped import scenario_path
 from echelon.sim.parts.loading import load, parse

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from echelon.plan.can_plan import BusRolePlan
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, TORQUE_FIELDS, Channel
+from echelon.plan.can_plan import BusRolePlan
 from echelon.plan.plan import NodePlan, Plan, RobotPlan
 
 CENTROID: Final = slice(0, len(GROUP_FIELDS))

@@ -1,6 +1,6 @@
 """The plan: a scenario as the roles need it, with every default filled in, every wildcard resolved and every instant an
-integer of nanoseconds.  Plain frozen data: it is made once (`echelon.planning.plan_maker`) and handed to every process.  What concerns
-the CAN bus stands in `echelon.plan.can_plan`.
+integer of nanoseconds.  Plain frozen data: it is made once (`echelon.planning.plan_maker`) and handed to every
+process.  What concerns the CAN bus stands in `echelon.plan.can_plan`.
 
 Members are numbered: robots first, in the order of the tree, then nodes, children before parents; the root is last.
 Blocks of the transformed state (theory.md section 2) stand in the order of their nodes, then the centroid.
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.plan.can_plan import DISTURBANCES, NEVER_NS, BusRolePlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan
 from echelon.errors import UserError
 from echelon.messages import Channel
+from echelon.plan.can_plan import DISTURBANCES, NEVER_NS, BusRolePlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan
 from echelon.plugins import Part
 
 Array = NDArray[np.float64]

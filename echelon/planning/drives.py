@@ -9,10 +9,10 @@ from math import ceil, inf
 from typing import Any, Final
 
 from echelon.plan.can_plan import NEVER_NS, BusPlan, CanPlan, DrivePlan, EnvelopePlan, EventPlan, MotorPlan
-from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop, Event
-from echelon.planning.node_ids import Place, ask, choose_nodes
 from echelon.plan.plan import PlanError, RobotPlan
+from echelon.planning.node_ids import Place, ask, choose_nodes
 from echelon.plugins import Part
+from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop, Event
 from echelon.scenario.values import path_matches
 
 RAW_MAX: Final = 32767

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, Tag
 from pydantic_core import ErrorDetails
 
+from echelon.plugins import PartError
+
 TEXTS: Final = {
     "float_type": "must be a number",
     "float_parsing": "must be a number",
@@ -46,28 +48,6 @@ class Mistake:
 
     keys: tuple[str | int, ...]
     text: str
-
-
-class PartError(ValueError):
-    """A scenario names a part (echelon.plugins) that cannot be had, or gives it wrong parameters.
-
-    `keys` lead from the part's place in the scenario to what is wrong.  `errors` are those of pydantic, if it is a parameter of
-    `model`; otherwise `text` says what is wrong with the value `shown`."""
-
-    def __init__(
-        self,
-        text: str,
-        keys: tuple[str, ...] = (),
-        shown: Any = None,
-        errors: Sequence[ErrorDetails] = (),
-        model: type[BaseModel] | None = None,
-    ) -> None:
-        super().__init__(text)
-        self.text, self.keys, self.shown, self.errors, self.model = text, keys, shown, errors, model
-
-    def at(self, *keys: str, shown: Any = None) -> "PartError":
-        """Returns the same mistake at other keys."""
-        return PartError(self.text, keys, shown, self.errors, self.model)
 
 
 def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[str | int, ...] = ()) -> list[Mistake]:

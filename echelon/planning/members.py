@@ -6,13 +6,13 @@ from math import isfinite, radians
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from echelon.planning.plan_maker import shapes
-from echelon.plan.can_plan import CanPlan
-from echelon.scenario.can_tables import DriveTable
-from echelon.planning.drives import DriveMaker, make_can
 from echelon.errors import Mistakes
+from echelon.plan.can_plan import CanPlan
 from echelon.plan.plan import NodePlan, PlanError, RobotPlan, ShapePlan
+from echelon.planning import shapes
+from echelon.planning.drives import DriveMaker, make_can
 from echelon.plugins import Part, Registry
+from echelon.scenario.can_tables import DriveTable
 from echelon.scenario.tables import Group, RobotTable, Scenario, Shape
 from echelon.scenario.values import Table
 

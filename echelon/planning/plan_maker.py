@@ -12,13 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from echelon.planning.blocks import fitting, make_blocks, make_coupling
-from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan, EventPlan
-from echelon.planning.drives import make_events
 from echelon.errors import Mistakes
-from echelon.plan.layout import sized
-from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
 from echelon.messages import Channel
+from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan, EventPlan
+from echelon.plan.layout import sized
 from echelon.plan.plan import (
     COORDINATOR,
     AvoidancePlan,
@@ -31,6 +28,9 @@ from echelon.plan.plan import (
     PlanError,
     RobotPlan,
 )
+from echelon.planning.blocks import fitting, make_blocks, make_coupling
+from echelon.planning.drives import make_events
+from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
 from echelon.plugins import Registry
 from echelon.scenario.tables import Law, LinkRule, Scenario, Uniform
 from echelon.scenario.values import path_matches

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from math import gcd
 from typing import Final
 
-from echelon.runtime.link import Link, LinkCounts
 from echelon.messages import Heard, Message
 from echelon.plan.plan import LinkPlan, Plan
 from echelon.role import Input, Role
+from echelon.runtime.link import Link, LinkCounts
 
 LEAD: Final = 32
 """Periods by which a role in a lockstep may be ahead of any of its sources.  A link that is late or loses would let it run

@@ -20,10 +20,10 @@ from dataclasses import dataclass, field
 from math import gcd
 from typing import Final
 
-from echelon.runtime.mailbox import Mailbox
 from echelon.messages import Message
 from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
+from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.session import Publisher, Session
 from echelon.runtime.turns import deadline_ns
 from echelon.runtime.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key

@@ -16,16 +16,15 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import BaseModel, PlainSerializer, PlainValidator, SerializationInfo, ValidationInfo, WithJsonSchema
 
-from echelon.planning.explain import PartError
-from echelon.plugins import Part, Registry, Source
+from echelon.plugins import Part, PartError, Registry, Source
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
 _NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.loading.load)"
 PART: Final = "part"
-"""Stands in the JSON schema of a field of this kind, with the group of its parts: echelon.scenario.schema says what may be written"""
+"""Key in the JSON schema of a field of this kind; its value is the group of the parts (see echelon.scenario.schema)"""
 BESIDE: Final = "beside"
-"""Stands there too; True: parameters are written beside the part's name; None: in a key of their own"""
+"""Key in the same place; True: parameters are written beside the part's name; None: in a key of their own"""
 
 
 class PartContext(NamedTuple):

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from echelon.scenario.part_fields import BESIDE, KIND, PART
 from echelon.plugins import Plugin, Registry
+from echelon.scenario.part_fields import BESIDE, KIND, PART
 from echelon.scenario.tables import Scenario
 from echelon.scenario.values import Table
 

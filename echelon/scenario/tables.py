@@ -1,8 +1,8 @@
 """The scenario: what a user writes, as pydantic models.  Every key is known, every value has a range and SI units.
 
 A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
-then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.planning.loading`; the plan that roles work with
-is made in `echelon.planning.plan_maker`; what concerns the CAN bus stands in `echelon.scenario.can_tables`.
+then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.planning.loading`; the plan that
+roles work with is made in `echelon.planning.plan_maker`; what concerns the CAN bus stands in `echelon.scenario.can_tables`.
 """
 
 from typing import Annotated, Literal
@@ -10,7 +10,14 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
 from echelon.scenario.can_tables import Can, DriveTable, EnvelopeTable, Event
-from echelon.scenario.part_fields import LawName, LawParameters, PlantField, TrajectoryField, WrittenLawName, written_use
+from echelon.scenario.part_fields import (
+    LawName,
+    LawParameters,
+    PlantField,
+    TrajectoryField,
+    WrittenLawName,
+    written_use,
+)
 from echelon.scenario.values import (
     CouplingGain,
     Finite,

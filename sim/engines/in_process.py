@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from echelon.agents.robot import make_robot
 from echelon.controller.node import TreeNode
-from echelon.runtime.link import LinkCounts
-from echelon.runtime.mailbox import Mailbox
 from echelon.messages import Heard, Message
 from echelon.plan.plan import NodePlan, Plan, RobotPlan
 from echelon.role import Role
+from echelon.runtime.link import LinkCounts
+from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.turns import Turn, level
 
 if TYPE_CHECKING:

@@ -13,10 +13,9 @@ from echelon.bridge.protocols.trial import try_protocols
 from echelon.controller.laws import LAWS, Law
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
 from echelon.errors import PartRunError
-from echelon.planning.explain import PartError
-from echelon.planning.loading import ScenarioError
 from echelon.plan.plan import Plan
-from echelon.plugins import Group, Part, Plugin, Registry, Source
+from echelon.planning.loading import ScenarioError
+from echelon.plugins import Group, Part, PartError, Plugin, Registry, Source
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.probe import probe
 from echelon.sim.parts.time_limit import TookTooLong, time_limit

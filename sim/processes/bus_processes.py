@@ -32,10 +32,10 @@ from echelon.plan.plan import Plan
 from echelon.role import Role
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
+from echelon.runtime.wire import data_key, encode, join, watch_key
 from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, hear_finish, meet
 from echelon.sim.processes.to_supervisor import Failed, PartFailed, Report, Said, Waiting
-from echelon.sim.recording.watchers import HIGH_WATER, Reception
-from echelon.runtime.wire import data_key, encode, join, watch_key
+from echelon.sim.processes.watchers import HIGH_WATER, Reception
 
 PROGRESS_S: Final = PROGRESS_NS / 1e9
 BATCH: Final = 16

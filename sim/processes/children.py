@@ -18,8 +18,8 @@ from typing import Any, Final
 
 from echelon.plan.plan import Plan, RobotPlan
 from echelon.runtime.session import loopback_endpoints
-from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.parts.foreign_parts import runs_text
+from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.process import main
 from echelon.sim.processes.to_supervisor import Done
 

@@ -9,13 +9,13 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
-from echelon.runtime.link import LinkCounts
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
 from echelon.runtime.session import Session
+from echelon.runtime.wire import SCHEMA_VERSION, token_key
 from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Ready, Report
-from echelon.runtime.wire import SCHEMA_VERSION, token_key
 
 READY_TIMEOUT_S: Final = 20.0
 

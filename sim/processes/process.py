@@ -18,8 +18,8 @@ from typing import Final
 from echelon.errors import PartRunError
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
-from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, meet
 from echelon.sim.engines.in_process import make_role
+from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, meet
 from echelon.sim.processes.to_supervisor import Failed, PartFailed, Waiting
 
 _PR_SET_PDEATHSIG: Final = 1
@@ -41,7 +41,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         if not spec.virtual and spec.kind == "recorder":
             os.nice(10)  # it has time, others have not
         if spec.kind == "recorder":
-            from echelon.sim.recording.watchers import run_recorder as body
+            from echelon.sim.processes.watchers import run_recorder as body
         elif spec.kind in ("bridge", "drives", "referee"):
             from echelon.sim.processes.bus_processes import body_of
 

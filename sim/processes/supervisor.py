@@ -14,13 +14,22 @@ from pathlib import Path
 from typing import Any, Final
 
 from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
-from echelon.runtime.link import LinkCounts
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.sim.processes.children import FINISHING, Child, list_specs, start
 from echelon.sim.processes.contract import ProcessSpec
-from echelon.sim.results.trace import Array, Trace, TraceBuilder
 from echelon.sim.processes.to_process import End, Finish, Start, Told
-from echelon.sim.processes.to_supervisor import Done, Failed, PartFailed, Ready, RecorderProgress, RecorderReport, Said, Waiting
+from echelon.sim.processes.to_supervisor import (
+    Done,
+    Failed,
+    PartFailed,
+    Ready,
+    RecorderProgress,
+    RecorderReport,
+    Said,
+    Waiting,
+)
+from echelon.sim.results.trace import Array, Trace, TraceBuilder
 
 NAMED: Final = 12
 """Processes that a note names; what is more is counted."""

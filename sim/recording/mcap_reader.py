@@ -22,11 +22,11 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS, TORQUE_FIELDS
 from echelon.messages import Channel as MessageChannel
 from echelon.plan.plan import Plan
-from echelon.sim.recording.mcap_reader import ros
+from echelon.runtime.link import LinkCounts
+from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import CHUNK_SIZE, MAGIC, METADATA
 from echelon.sim.recording.recorder import LINKS, SCENARIO, state_topic, torque_topic
 from echelon.sim.results.trace import Trace

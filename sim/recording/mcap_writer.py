@@ -33,7 +33,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from echelon.sim.recording.mcap_reader import ros
+from echelon.sim.recording import ros
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "echelon"

@@ -8,12 +8,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from echelon.bridge.roles.frame_message import TimedFrame
-from echelon.plan.layout import NodeLayout, length
-from echelon.runtime.link import LinkCounts
+from echelon.bridge.frame_message import TimedFrame
 from echelon.messages import Channel, Message
+from echelon.plan.layout import NodeLayout, length
 from echelon.plan.plan import Plan
-from echelon.sim.recording.mcap_reader import ros
+from echelon.runtime.link import LinkCounts
+from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import ChunkedFile
 from echelon.sim.recording.scene import DESIRED, Scene, desired
 

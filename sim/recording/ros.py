@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.runtime.link import LinkCounts
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, TORQUE_FIELDS
+from echelon.runtime.link import LinkCounts
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from echelon.messages import STATE_FIELDS, Values
 from echelon.plan.plan import NodePlan, Plan
-from echelon.sim.recording.mcap_reader import ros
+from echelon.sim.recording import ros
 from echelon.sim.results.desired import Desired
 
 Array = NDArray[np.float64]

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan.plan import Plan
-from echelon.sim.results.desired import Desired
 from echelon.sim.report.drawing import (
     CENTROID,
     GROUPS,
@@ -28,6 +27,7 @@ from echelon.sim.report.drawing import (
     time_axis,
 )
 from echelon.sim.results.block_series import Blocks, BlockSeries
+from echelon.sim.results.desired import Desired
 from echelon.sim.results.distances import Distances, distances
 from echelon.sim.results.settling import settle
 from echelon.sim.results.trace import Trace

@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from echelon.controller.transformation import node_matrix
-from echelon.runtime.link import LinkCounts
 from echelon.messages import Channel
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.sim.results.trace import Array
 
 UP: Final = (Channel.STATE, Channel.GROUP_STATE)

@@ -12,8 +12,8 @@ import numpy as np
 
 from echelon.bridge.reports import CanReport
 from echelon.plan.plan import Plan
-from echelon.sim.results.can_lines import finding_text, some
 from echelon.sim.results.block_series import Blocks
+from echelon.sim.results.can_lines import finding_text, some
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.ending import Ending
 from echelon.sim.results.records import (

@@ -17,8 +17,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.runtime.link import LinkCounts
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.sim.results.ages import lag_times, loop_jitter
 from echelon.sim.results.block_series import Blocks, BlockSeries
 from echelon.sim.results.rates import Fit, amplitude, decay

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.bridge.protocols.frame import WHEELS
-from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.sim.results.block_series import Blocks, BlockSeries
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.ending import Ending

@@ -6,8 +6,8 @@ import numpy as np
 
 from echelon.bridge.reports import CanReport
 from echelon.runtime.link import LinkCounts
-from echelon.sim.results.can_lines import can_lines
 from echelon.sim.results.block_series import block_series
+from echelon.sim.results.can_lines import can_lines
 from echelon.sim.results.checks import Evidence, verdict
 from echelon.sim.results.distances import distances
 from echelon.sim.results.ending import endings

@@ -13,8 +13,8 @@ from rich.text import Text
 
 from echelon.controller.transformation import Transformation
 from echelon.plan.plan import Plan
-from echelon.sim.results.desired import Desired
 from echelon.sim.processes.supervisor import Progress
+from echelon.sim.results.desired import Desired
 
 PLAIN_S = 2.0
 """Between two plain lines."""

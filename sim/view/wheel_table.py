@@ -11,10 +11,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from echelon.bridge.timing.bus_load import frame_bits
 from echelon.bridge.protocols.frame import WHEELS, Frame
 from echelon.bridge.protocols.observe import Finding, WheelReading
 from echelon.bridge.referee.referee import Referee
+from echelon.bridge.timing.bus_load import frame_bits
 from echelon.plan.plan import Plan, RobotPlan
 
 HALF: Final = 8

@@ -8,8 +8,6 @@ from math import inf, isinf, isnan, nan
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from support.synthetic import PAPER
-from support.trees import plan_of, scenario
 
 from echelon.agents.plant import GRAVITY, LOST, PLANTS, RobotState, make_step, state_at
 from echelon.agents.robot import Robot
@@ -17,6 +15,8 @@ from echelon.messages import Channel, Message
 from echelon.plan.plan import Array, RobotPlan
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load
+from support.synthetic import PAPER
+from support.trees import plan_of, scenario
 
 HILL = {"rise": (0.05, -0.1), "load": 1.5, "resistance": 3.0}
 IN_FILE = {"hill": "{use='hill',parameters={rise=[0.05,-0.1],load=1.5,resistance=3.0}}"}

@@ -7,8 +7,6 @@ from math import cos, inf, nan, sin
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from support.synthetic import PAPER
-from support.trees import plan_of, scenario
 
 from echelon.agents.plant import RobotState, make_step, state_at
 from echelon.agents.robot import Robot
@@ -16,6 +14,8 @@ from echelon.agents.torque import TorqueLimits, make_inverse
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan.plan import Array, RobotPlan
 from echelon.sim.parts.loading import load
+from support.synthetic import PAPER
+from support.trees import plan_of, scenario
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 STATES = list(product((0.0, 1.1, -2.5), (-1.2, 0.0, 0.8), (-6.0, 0.0, 3.0)))

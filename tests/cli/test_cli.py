@@ -10,10 +10,10 @@ from pathlib import Path
 
 import cantools
 import pytest
-from support.runs import ROOT, echelon, plan_of, trace_of
 
 from echelon.messages import STATE_FIELDS
 from echelon.sim.recording.mcap_reader import read_links, read_metadata, read_scenario, read_trace
+from support.runs import ROOT, echelon, plan_of, trace_of
 
 QUICK = ("--set", "duration=0.2", "--set", "claims=[]")
 

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.runs import ROOT, echelon
 
 from echelon.cli.machine import completion_script
 from echelon.cli.parser import ENTRIES, FIRST_LOOK, make_parser
+from support.runs import ROOT, echelon
 
 BIN = Path(sys.executable).parent
 EXAMPLES = sorted(

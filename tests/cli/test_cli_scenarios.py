@@ -9,14 +9,12 @@ from typing import Any
 import cantools
 import pytest
 from jsonschema import Draft202012Validator
-from support.runs import ROOT, echelon, summary_of
-from support.synthetic import run_facts
 
 from echelon.bridge.timing.fit import plan_fit
 from echelon.cli.new_scenario import scenario_text, sizes
 from echelon.planning.loading import effective_toml
-from echelon.scenario.tables import Scenario
 from echelon.scenario.schema import reference_page, scenario_schema
+from echelon.scenario.tables import Scenario
 from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import REGISTRY, parse
@@ -24,6 +22,8 @@ from echelon.sim.results.records import Verdict
 from echelon.sim.results.rendering import summary_schema
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import TraceBuilder
+from support.runs import ROOT, echelon, summary_of
+from support.synthetic import run_facts
 
 LAB = shipped()["lab"].read_text(encoding="utf-8")
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
-from support.runs import echelon, kill_session, plan_of, start_echelon
 
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.can.bus_url import resolve_url
 from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.protocols.registry import make_host
 from echelon.cli.drive_bench import bench_facts, bench_lines
+from support.runs import echelon, kill_session, plan_of, start_echelon
 
 PATIENCE_S = 20.0
 

@@ -5,12 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import plan_of as shipped
-from support.runs import trace_of
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, root
-from test_sampled import growth, single
-from support.trees import PAPER_TREE, plan_of, random_epsilon, scenario, with_random_gains
 
 from echelon.controller.laws import Block, Integral
 from echelon.controller.laws.central import CentralLaw
@@ -19,6 +15,10 @@ from echelon.controller.prediction.sampled import delay_margin, largest_stable_d
 from echelon.plan.plan import Array, Plan
 from echelon.sim.parts.loading import REGISTRY, load
 from echelon.sim.results.block_series import block_series
+from support.growth import growth, single
+from support.runs import SCENARIOS, trace_of
+from support.runs import plan_of as shipped
+from support.trees import PAPER_TREE, plan_of, random_epsilon, scenario, with_random_gains
 
 REST = {"kind": "line", "velocity": (0.0, 0.0)}
 
@@ -226,7 +226,7 @@ def test_what_the_controller_does_not_know_vanishes_in_runs():
 
 def test_the_loop_of_a_heavier_robot_is_stable_where_its_own_polynomial_is():
     """A robot of m instead of m1 does m1/m of what it is told: σ³ p³ + r (k2 p² + k1 p + k_i), stable iff k_i < r k1 k2."""
-    _, plan = load(Path(__file__).parent.parent / "deploy/scenarios/integral.toml")
+    _, plan = load(SCENARIOS / "integral.toml")
     r, k1, k2 = 4 / 6, 0.5, 1.0
     assert r * k1 * k2 > 0.1
     assert linear_gains(plan, plan.blocks[-1], 0.0).K_i[0, 0] == pytest.approx(0.1)

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 from scipy.optimize import root
-from support.synthetic import PAPER
-from support.trees import PAPER_TREE, plan_of, random_epsilon, random_law, scenario, trees, with_random_gains
 
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.in_tree import BlockGains
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.plan.plan import Array, AvoidancePlan, Plan
 from echelon.sim.parts.loading import load
+from support.synthetic import PAPER
+from support.trees import PAPER_TREE, plan_of, random_epsilon, random_law, scenario, trees, with_random_gains
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)

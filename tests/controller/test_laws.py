@@ -5,22 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import SCENARIOS, plan_of, trace_of
-from test_node import Watched, random_plan
-from support.trees import PAPER_TREE
 
 from echelon.agents.robot import Robot
 from echelon.controller.laws import Block, Law, Linear
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.law import law_block, make_nu, make_state, make_weight
 from echelon.errors import PartRunError
-from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.plan.plan import Plan
+from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.plugins import Part
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load, parse
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.measures import claim_results
+from support.runs import SCENARIOS, plan_of, trace_of
+from support.trees import PAPER_TREE
+from support.watched import Watched, random_plan
 
 OWN = """
 import numpy as np

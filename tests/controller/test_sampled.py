@@ -9,28 +9,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
-from support.synthetic import PAPER
-from support.trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_random_gains
 
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.in_tree import BlockGains
-from echelon.controller.prediction.sampled import delay_margin, error_map, largest_stable_delay, spectral_radius, tick_gains
+from echelon.controller.prediction.sampled import (
+    delay_margin,
+    error_map,
+    largest_stable_delay,
+    spectral_radius,
+    tick_gains,
+)
 from echelon.controller.trajectory import Line
 from echelon.plan.plan import Array, Plan
 from echelon.plugins import Part
 from echelon.sim.parts.loading import load
+from support.growth import growth, single
+from support.synthetic import PAPER
+from support.trees import PAPER_TREE, plan_of, random_epsilon, scenario, trees, with_random_gains
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=30)
 SEEDS = st.integers(0, 2**32 - 1)
 REST = {"kind": "line", "velocity": (0.0, 0.0)}
-
-
-def single(T: float, lead: float = 0.0, k1: float = 1.0, k2: float = 1.0) -> Plan:
-    """Returns one robot alone: all there is is the centroid, with σ = 1."""
-    law = {"epsilon": [1.0], "lead": lead, "gains": [{"k1": k1, "k2": k2}]}
-    return plan_of(
-        scenario((None,), np.random.default_rng(1), duration=T, law=law, periods={"acceleration": T, "torque": T})
-    )
 
 
 def random_plan(tree, seed: int, T: float) -> Plan:
@@ -58,13 +57,6 @@ def run(plan: Plan, delay_ticks: int, ticks: int) -> Array:
         if norms[tick] > 1e100:
             return norms[: tick + 1]
     return norms
-
-
-def growth(norms: Array) -> float:
-    """Returns the logarithm of the growth per tick over the second half of a run, by its largest values."""
-    part = len(norms) // 8
-    early, late = norms[4 * part : 5 * part].max(), norms[-part:].max()
-    return float(np.log(late / early) / (len(norms) - 5 * part))
 
 
 def histories(plan: Plan, delay_ticks: int) -> Array:

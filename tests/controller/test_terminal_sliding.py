@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.runs import trace_of
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
-from support.trees import ROBOT, plan_of, scenario
 
 from echelon.controller.laws import Block, TerminalSliding
 from echelon.plan.plan import Array
 from echelon.sim.parts.loading import REGISTRY
 from echelon.sim.results.block_series import block_series
+from support.runs import trace_of
+from support.trees import ROBOT, plan_of, scenario
 
 
 def least(gamma: float, beta: float) -> float:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.synthetic import PAPER
-from support.trees import PAPER_TREE, Tree, plan_of, scenario, trees
 
 from echelon.controller.transformation import Transformation, desired_shape, node_matrix, subtree_robots
 from echelon.plan.plan import Array, ShapePlan
 from echelon.sim.parts.loading import load
+from support.synthetic import PAPER
+from support.trees import PAPER_TREE, Tree, plan_of, scenario, trees
 
 WEIGHTS = st.lists(st.integers(1, 30), min_size=1, max_size=12)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -4,13 +4,13 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
-from support.trees import plan_of, random_epsilon, scenario, trees, with_random_gains
 
 from echelon.controller.laws.central import CentralLaw
-from echelon.plan.layout import CENTROID, POSITION, NodeLayout, acceleration_of, said_by
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, Channel, Message
+from echelon.plan.layout import CENTROID, POSITION, NodeLayout, acceleration_of, said_by
 from echelon.plan.plan import NodePlan, Plan
 from echelon.sim.engines.in_process import Engine
+from support.trees import plan_of, random_epsilon, scenario, trees, with_random_gains
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=25)
 COUPLINGS = st.sampled_from([0.0, 0.5])

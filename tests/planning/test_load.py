@@ -13,12 +13,13 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from echelon import shipped
 from echelon.errors import one_line
 from echelon.planning.explain import TEXTS, key_text, value_text
 from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
 
-SCENARIOS = sorted((Path(__file__).resolve().parent.parent / "deploy" / "scenarios").glob("*.toml"))
+SCENARIOS = sorted(shipped.FOLDER.glob("*.toml"))
 TEXTS_OF = {path.stem: path.read_text(encoding="utf-8") for path in SCENARIOS}
 BASE = """
 name = "t"

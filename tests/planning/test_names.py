@@ -5,12 +5,12 @@ from pathlib import Path
 
 import cantools
 import pytest
-from support.runs import echelon, plan_of, summary_of
 
 from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
-from echelon.sim.recording.recorder import frame_topics
 from echelon.sim.recording.mcap_reader import _records, read_trace
+from echelon.sim.recording.recorder import frame_topics
+from support.runs import echelon, plan_of, summary_of
 
 TEXT = """
 name = "circle-two"

@@ -1,22 +1,22 @@
 import math
 import re
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_shapes import variables
 
-from echelon.planning.loading import ScenarioError
-from echelon.planning.members import MAX_ROBOTS, nanoseconds
+from echelon import shipped
 from echelon.messages import Channel
 from echelon.plan.plan import Plan, PlanError
+from echelon.planning.loading import ScenarioError
+from echelon.planning.members import MAX_ROBOTS, nanoseconds
 from echelon.planning.plan_maker import path_matches
 from echelon.sim.parts.loading import load, parse
+from support.shape_variables import variables
 
-SCENARIOS = Path(__file__).resolve().parent.parent / "deploy" / "scenarios"
+SCENARIOS = shipped.FOLDER
 HEAD = """
 name = "t"
 duration = 1.0

@@ -12,14 +12,15 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 import echelon.scenario.tables
+from echelon import shipped
 from echelon.controller.trajectory import Waypoints
+from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.scenario.part_fields import PartContext
-from echelon.plan.plan import Plan
 from echelon.scenario.tables import RobotTable, Scenario, Shape
 from echelon.sim.parts.loading import REGISTRY, load, parse
 
-SCENARIOS = sorted((Path(__file__).resolve().parent.parent / "deploy" / "scenarios").glob("*.toml"))
+SCENARIOS = sorted(shipped.FOLDER.glob("*.toml"))
 
 
 def digest(plan: Plan) -> str:

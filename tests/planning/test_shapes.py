@@ -1,24 +1,15 @@
 from itertools import combinations, pairwise
-from math import cos, dist, hypot, pi, sin, sqrt
+from math import cos, dist, hypot, pi, sin
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.planning.shapes import column, line, polygon, rotated, triangle, wedge
+from support.shape_variables import variables
 
 counts = st.integers(1, 40)
 lengths = st.floats(1e-3, 1e3)
-SQRT2 = sqrt(2)
-
-
-def variables(points):
-    """The shape variables of equal weights, written out from theory.md section 2."""
-    found = [tuple((a - b) / SQRT2 for a, b in zip(points[0], points[1], strict=True))]
-    for k in range(2, len(points)):
-        mean = [sum(point[axis] for point in points[:k]) / k for axis in (0, 1)]
-        found.append((points[k][0] - mean[0], points[k][1] - mean[1]))
-    return found
 
 
 @given(lengths)

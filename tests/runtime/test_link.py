@@ -5,9 +5,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from echelon.runtime.link import Link, draws, link_key
 from echelon.messages import Channel
 from echelon.plan.plan import LinkPlan
+from echelon.runtime.link import Link, draws, link_key
 
 MS = 1_000_000
 UNIFORM = LinkPlan(0, 9, Channel.STATE, MS, MS, 3 * MS, 0.1)

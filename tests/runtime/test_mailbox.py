@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon.runtime.link import Link
-from echelon.runtime.mailbox import SLACK, Mailbox
 from echelon.messages import NULL, Channel, Message
 from echelon.plan.plan import LinkPlan
 from echelon.role import Input, Stage
+from echelon.runtime.link import Link
+from echelon.runtime.mailbox import SLACK, Mailbox
 from echelon.runtime.turns import Turn
 
 PERIOD = 10

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.runs import plan_of, trace_of
 
 import echelon.runtime.runner
-from echelon.runtime.mailbox import LEAD
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
+from echelon.runtime.mailbox import LEAD
 from echelon.runtime.runner import MAX_BATCHES, Runner
 from echelon.runtime.session import Receive
+from echelon.runtime.wire import data_key, decode, encode, split
 from echelon.sim.engines.in_process import Engine, make_role
 from echelon.sim.results.trace import TraceBuilder
-from echelon.runtime.wire import data_key, decode, encode, split
+from support.runs import plan_of, trace_of
 
 RUN = "test"
 TIMEOUT_S = 20.0

@@ -4,14 +4,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
-from support.trees import Tree, plan_of, scenario, trees
 
-from echelon.plan.can_plan import BusRolePlan
 from echelon.messages import Channel
+from echelon.plan.can_plan import BusRolePlan
 from echelon.plan.plan import NodePlan, Plan, RobotPlan
 from echelon.role import Role
-from echelon.sim.engines.in_process import make_roles
 from echelon.runtime.turns import ON_BUS, Turn, deadline_ns, level, turns
+from echelon.sim.engines.in_process import make_roles
+from support.trees import Tree, plan_of, scenario, trees
 
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=25)
 WHOSE = {

@@ -8,20 +8,20 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from pyarrow import parquet
-from support.synthetic import FIELD, decaying, link_counts, run_facts
 
 import echelon
 from echelon.bridge.protocols.frame import Frame
 from echelon.controller.transformation import Transformation
 from echelon.errors import UsageError
-from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS
+from echelon.runtime.link import LinkCounts
 from echelon.sim.export import export_csv, export_parquet
+from echelon.sim.finished_run import Run
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.frames import frames_table
-from echelon.sim.results.run import Run
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+from support.synthetic import FIELD, decaying, link_counts, run_facts
 
 
 def finished(trace: Trace, links: Sequence[LinkCounts] = ()) -> Run:

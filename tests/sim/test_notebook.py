@@ -9,12 +9,12 @@ import nbformat
 import numpy as np
 import pytest
 from nbclient import NotebookClient
-from support.runs import ROOT, SCENARIOS, plan_of, summary_of, trace_of
-from support.runs import echelon as command
 
 import echelon
 from echelon.messages import STATE_FIELDS
 from echelon.sim.notebook import toml_value
+from support.runs import ROOT, SCENARIOS, plan_of, summary_of, trace_of
+from support.runs import echelon as command
 
 SHORT = {"duration": 0.5, "claims": []}
 IN_PROCESS = ("--engine", "inprocess", "--quiet", "--no-report", "--set", "duration=0.5", "--set", "claims=[]")

@@ -2,22 +2,21 @@
 
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
+from echelon import shipped
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, Channel, Message
 from echelon.plan.plan import Plan
 from echelon.sim.parts.loading import load
 
-ROOT = Path(__file__).parents[1]
 METADATA = {"version": "0.1.0", "host": "any"}
 
 
 @cache
 def paper() -> Plan:
     """Returns the plan of the paper's scenario."""
-    return load(ROOT / "deploy/scenarios/paper.toml")[1]
+    return load(shipped.FOLDER / "paper.toml")[1]
 
 
 def invented(plan: Plan, ticks: int, seed: int = 1) -> Iterator[Message]:

@@ -13,7 +13,7 @@ from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load
 from echelon.sim.results.trace import Trace, TraceBuilder
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SCENARIOS = ROOT / "deploy" / "scenarios"
 EXAMPLES = ROOT / "examples"
 

@@ -2,24 +2,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from echelon import shipped
 from echelon.bridge.reports import BusReport, CanReport
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
-from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.loading import load
 from echelon.sim.results.records import RunFacts
 from echelon.sim.results.trace import Trace
 
-PAPER = Path(__file__).parent.parent / "deploy" / "scenarios" / "paper.toml"
+PAPER = shipped.FOLDER / "paper.toml"
 DECAY = {"intra": 0.02, "inter": 0.2, "centroid": 2.0}
 """Time constants [s] of a layer's error"""
 PINNED = (

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from numpy.random import Generator
 
 from echelon.plan.layout import sized
-from echelon.scenario.part_fields import PartContext
 from echelon.plan.plan import Plan
 from echelon.planning.plan_maker import make_plan
+from echelon.scenario.part_fields import PartContext
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.loading import REGISTRY
 

@@ -11,8 +11,8 @@ import canopen
 import pytest
 from canopen.profiles.p402 import State402
 
-from echelon.bridge.protocols.registry import cia402
 from echelon.bridge.can.bus import open_bus
+from echelon.bridge.protocols import cia402
 from echelon.bridge.protocols.cia402.drive import Cia402Drive
 from echelon.bridge.protocols.cia402.host import Cia402Host, Master
 from echelon.bridge.protocols.frame import Frame

@@ -15,9 +15,9 @@ import cantools
 import pytest
 
 from echelon.bridge.protocols.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
-from echelon.sim.view.live import Display
 from echelon.sim.parts.loading import load
 from echelon.sim.run import execute
+from echelon.sim.view.live import Display
 from vcan.test_vcan import ip, listener, next_frame, somebody_listens
 
 pytestmark = pytest.mark.vcan

@@ -3,7 +3,14 @@
 from typing import NamedTuple
 
 from echelon.bridge.protocols.cia402 import objects
-from echelon.bridge.protocols.cia402.codec import HOST_NODE, MODE_CYCLIC_TORQUE, RPDO_IDS, TPDO_IDS, milliseconds, rated_mnm
+from echelon.bridge.protocols.cia402.codec import (
+    HOST_NODE,
+    MODE_CYCLIC_TORQUE,
+    RPDO_IDS,
+    TPDO_IDS,
+    milliseconds,
+    rated_mnm,
+)
 from echelon.bridge.protocols.cia402.sdo import Key
 from echelon.plan.can_plan import DrivePlan
 

@@ -1,4 +1,4 @@
-"""What a device profile adds to a CANopen node: the node (bridge.protocols.cia402.node) asks, the device (bridge.protocols.cia402.drive) does."""
+"""What a device profile adds to a CANopen node: node.py asks, the device in drive.py answers."""
 
 from abc import ABC, abstractmethod
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Native(DriveProtocol):
-    """One drive for both wheels of a robot, with identifiers that are a base plus the robot's number (bridge.protocols.native.codec)."""
+    """One drive for both wheels of a robot.  Its identifiers are a base plus the robot's number (codec.py)."""
 
     wheels: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1),)
     nodes: ClassVar[range] = range(127)

@@ -1,4 +1,4 @@
-"""The bridge's side of the native protocol: commands a robot's drive, and learns from its feedback (bridge.protocols.native.codec)."""
+"""The bridge's side of the native protocol: commands a robot's drive, and reads its feedback."""
 
 from echelon.bridge.protocols.cyclic import Command, CyclicHost, Feedback
 from echelon.bridge.protocols.frame import Frame

@@ -13,7 +13,7 @@ import pytest
 
 from echelon.bridge.can.canlog import FLUSH_NS, CanLog
 from echelon.bridge.protocols.native.codec import NativeCodec, frame_id
-from support.runs import lab_dbc
+from support.runs import ROOT, lab_dbc
 
 EPOCH = 1_700_000_000_000_000_000
 DATA = bytes.fromhex("e80324fa010700f3")
@@ -55,9 +55,7 @@ def test_a_killed_process_loses_only_what_is_younger(tmp_path: Path) -> None:
         "for number in range(1000): log.write(number, 1, bytes(8), number * FLUSH_NS // 100)\n"
         "os.kill(os.getpid(), 9)\n"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", program, str(path)], cwd=Path(__file__).parents[1], timeout=60, check=False
-    )
+    run = subprocess.run([sys.executable, "-c", program, str(path)], cwd=ROOT, timeout=60, check=False)
     assert run.returncode == -signal.SIGKILL
     lines = path.read_text().splitlines()
     assert 900 <= len(lines) <= 1000  # 1000 frames in 1 s of wall time: at most the last 0.1 s is missing

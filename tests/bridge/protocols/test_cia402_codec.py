@@ -12,7 +12,7 @@ from canopen.profiles.p402 import OperationMode, State402
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon.bridge.protocols.registry import cia402
+from echelon.bridge.protocols import cia402
 from echelon.bridge.protocols.cia402 import codec
 from echelon.bridge.protocols.cia402.codec import (
     AUTOMATIC,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 
+from conformance.test_drives import Rig, enabled_rig
 from echelon.bridge.protocols.cyclic import WheelState
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.motor import LATCHING, Fault
@@ -13,7 +14,6 @@ from echelon.bridge.protocols.native.codec import FaultCode, Feedback, NativeCod
 from echelon.bridge.protocols.native.observe import NativeObserver
 from echelon.bridge.protocols.observe import Finding
 from support.bench_drives import ENVELOPE, MS, drive_plan
-from conformance.test_drives import Rig, enabled_rig
 
 ROBOT = 3
 COMMAND, FEEDBACK, STATUS = 0x103, 0x183, 0x203

@@ -11,8 +11,8 @@ from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.plan_dbc import plan_dbc
 from echelon.bridge.protocols.registry import make_drive, make_host, make_observer
 from echelon.errors import PartRunError
-from echelon.planning.loading import ScenarioError
 from echelon.plan.plan import Plan
+from echelon.planning.loading import ScenarioError
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load
 from support.runs import EXAMPLES, echelon, summary_of

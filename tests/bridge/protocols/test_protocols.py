@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from echelon.bridge.protocols.registry import PROTOCOLS, drive_places, make_drive, make_host, make_observer, protocol_of
 from echelon.bridge.referee.referee import judge_log
-from echelon.planning.loading import ScenarioError
 from echelon.plan.plan import Plan
+from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
 from support.runs import EXAMPLES, SCENARIOS, echelon, plan_of
 
@@ -175,7 +175,11 @@ def test_a_process_that_gets_a_plan_imports_no_more_of_protocols_than_their_clas
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     modules = set(done.stdout.split())
     assert "echelon.bridge.protocols.cia402" in modules
-    assert not [name for name in modules if name.startswith(("echelon.bridge.protocols.cia402.", "echelon.bridge.protocols.cyclic"))]
+    assert not [
+        name
+        for name in modules
+        if name.startswith(("echelon.bridge.protocols.cia402.", "echelon.bridge.protocols.cyclic"))
+    ]
     assert not modules & {"cantools", "can", "zenoh"}
 
 

@@ -11,17 +11,17 @@ import pytest
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.runs import plan_of
 
 from echelon.bridge.can.canlog import CanLog
+from echelon.bridge.frame_message import unpack
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import unpack
 from echelon.bridge.referee.referee import KEPT, Referee, judge_log
 from echelon.bridge.reports import FindingReport
 from echelon.bridge.stations.mirror import MirrorBridge
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.sim.engines.in_process import Engine
+from support.runs import plan_of
 
 MS = 1_000_000
 Heard = tuple[int, int, Frame]

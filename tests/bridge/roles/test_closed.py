@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
+from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.roles.commander import NOT_COMMANDED, Commander
 from echelon.bridge.roles.drive_bank import DriveBank
-from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import BRIDGE_NODE, TimedFrame, pack, unpack
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.sim.engines.in_process import Engine

@@ -11,9 +11,9 @@ from itertools import count
 from types import FrameType, ModuleType
 
 import pytest
-from test_envelope import CHECKS
 
 from echelon.bridge.roles import envelope
+from support.envelope_checks import CHECKS
 
 SOURCE = inspect.getsource(envelope)
 CPU_SECONDS = 2.0  # a mutant may loop for ever

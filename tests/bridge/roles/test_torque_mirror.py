@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon.bridge.timing.bus_load import frame_bits
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.native.codec import NativeCodec, Torque
 from echelon.bridge.protocols.native.counter import CounterCheck
 from echelon.bridge.protocols.native.host import NativeHost
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.torque_mirror import Stop, TorqueMirror
+from echelon.bridge.timing.bus_load import frame_bits
 from support.bench_drives import drive_plan
 
 MS = 1_000_000

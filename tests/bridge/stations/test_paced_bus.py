@@ -7,12 +7,12 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.stations.paced_bus import PacedBus
+from echelon.bridge.timing.arbitration import BusTime
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.bus_model import BusEventKind
-from echelon.bridge.timing.arbitration import BusTime
-from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.timing.ideal_bus import IdealBus
-from echelon.bridge.stations.paced_bus import PacedBus
 
 BIT = 2_000  # ns at 500 kbit/s
 LONGEST = worst_case_bits(8) * BIT

@@ -7,8 +7,8 @@ from itertools import count
 import pytest
 
 from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.frame_message import NO_BUS, TimedFrame, pack
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import NO_BUS, TimedFrame, pack
 from echelon.bridge.stations import rail as on_bus_module
 from echelon.bridge.stations.rail import BusError, Rail, on_bus
 from echelon.messages import Channel, Heard, Message

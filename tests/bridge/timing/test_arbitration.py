@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import Philox
 
+from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.timing.arbitration import BusTime
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.bus_model import BusEvent, BusEventKind, BusModel, Delivered
-from echelon.bridge.timing.arbitration import BusTime
-from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.timing.ideal_bus import IdealBus
 
 MEGA = 1_000_000

@@ -2,9 +2,9 @@
 
 import pytest
 
+from echelon.bridge.protocols.registry import shared_cyclic
 from echelon.bridge.roles.commander import Commander
 from echelon.bridge.timing.fit import bus_fit, robot_streams
-from echelon.bridge.protocols.registry import shared_cyclic
 from echelon.sim.engines.in_process import Engine
 from support.runs import plan_of
 

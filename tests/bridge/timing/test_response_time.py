@@ -9,9 +9,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
-from echelon.bridge.timing.arbitration import BusTime
 from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.response_time import BITRATES, Stream, advice, fits, load, remedies, response_times
 
 MS = 1_000_000

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.runs import echelon, plan_of
 
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import resolve_url
-from echelon.sim.doctor.doctor import can_checks
-from echelon.sim.doctor.doctor import doctor
-from echelon.sim.doctor.doctor import Measured
+from echelon.sim.doctor import can_checks
+from echelon.sim.doctor.doctor import Measured, doctor
 from echelon.sim.doctor.finding import Finding
+from support.runs import echelon, plan_of
 
 
 def test_this_machine_can_run_lab_and_says_so() -> None:

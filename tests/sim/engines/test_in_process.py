@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from support.synthetic import PAPER
 
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.prediction.sampled import spectral_radius
@@ -18,6 +17,7 @@ from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances
 from echelon.sim.results.measures import claim_results
 from echelon.sim.results.trace import Trace, TraceBuilder
+from support.synthetic import PAPER
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 UNTIL = 2.0

@@ -10,13 +10,13 @@ from pathlib import Path
 from subprocess import CompletedProcess
 
 import pytest
-from support.runs import SCENARIOS, echelon, start_echelon, summary_of
 
 from echelon.bridge.can.canlog import read_log
 from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
-from echelon.sim.recording.mcap_reader import read_trace
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
+from echelon.sim.recording.mcap_reader import read_trace
+from support.runs import SCENARIOS, echelon, start_echelon, summary_of
 
 LAW = """
 from echelon.controller.laws import Law

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from echelon.bridge.can.bus import Bus, open_bus
-from echelon.bridge.timing.bus_load import frame_bits
 from echelon.bridge.can.bus_url import resolve_url
 from echelon.bridge.can.canlog import read_log
-from echelon.bridge.roles.frame_message import BRIDGE_NODE
+from echelon.bridge.frame_message import BRIDGE_NODE
 from echelon.bridge.protocols.native.codec import BASE_ID, FEEDBACK_ID, NativeCodec
+from echelon.bridge.timing.bus_load import frame_bits
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.supervisor import Supervisor
 from support.runs import echelon, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, until

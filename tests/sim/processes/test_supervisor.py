@@ -11,13 +11,23 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
-from support.runs import descendants, kill_session, pid_of, plan_of, session_members, start_echelon, summary_of, trace_of, until
 
 from echelon.plan.plan import Plan
-from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.parts.loading import parse
-from echelon.sim.recording.mcap_reader import read_trace, recover
+from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.supervisor import NAMED, Outcome, Progress, Supervisor, few
+from echelon.sim.recording.mcap_reader import read_trace, recover
+from support.runs import (
+    descendants,
+    kill_session,
+    pid_of,
+    plan_of,
+    session_members,
+    start_echelon,
+    summary_of,
+    trace_of,
+    until,
+)
 
 LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
 LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0},{channel="reference",loss=1.0}]'

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.invented import METADATA, invented, paper
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from echelon.runtime.link import LinkCounts
 from echelon.messages import Channel, Message
-from echelon.sim.recording.mcap_reader import mcap_writer as chunked
-from echelon.sim.recording.recorder import Recorder
+from echelon.runtime.link import LinkCounts
+from echelon.sim.recording import mcap_writer as chunked
 from echelon.sim.recording.mcap_reader import CutError, read_links, read_metadata, read_scenario, read_trace, recover
+from echelon.sim.recording.recorder import Recorder
 from echelon.sim.results.trace import TraceBuilder
+from support.invented import METADATA, invented, paper
 
 SCENARIO = 'name = "µ"\r\n'
 LINKS = [LinkCounts(0, 9, Channel.STATE, 21, 20, 1, 0, 20, 2, 1.5e6 / 7, 3_000_000)]

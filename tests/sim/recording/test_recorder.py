@@ -1,4 +1,4 @@
-"""sim.recording.recorder, sim.recording.mcap_writer, sim.recording.scene: what is in a file, that it is always the same, and what outlives what."""
+"""What is in a recording, that it is always the same, and what survives when something fails."""
 
 import json
 import math
@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from support.invented import METADATA, ROOT, invented, paper
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from echelon.bridge.frame_message import TimedFrame
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import TimedFrame
-from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS, Channel, Message
-from echelon.sim.recording.mcap_reader import mcap_writer as chunked
-from echelon.sim.recording.mcap_reader import mcap_reader as recording
+from echelon.runtime.link import LinkCounts
+from echelon.sim.recording import mcap_reader as recording
+from echelon.sim.recording import mcap_writer as chunked
 from echelon.sim.recording.recorder import Recorder
+from support.invented import METADATA, ROOT, invented, paper
 
 SCENARIO = 'name = "invented"\n'
 LINKS = [

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from echelon.runtime.link import LinkCounts
 from echelon.messages import STATE_FIELDS, Channel
-from echelon.sim.recording.mcap_reader import ros
+from echelon.runtime.link import LinkCounts
+from echelon.sim.recording import ros
 
 
 def make_typestore() -> Any:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
 
 from echelon.bridge.reports import (
     BusEvent,
@@ -25,6 +24,7 @@ from echelon.sim.report.drawing import COLUMNS, thin
 from echelon.sim.report.report import RunForReport, write_report
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+from support.synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
 
 FIGURES = 5
 NAME = "one & <b>only</b>"

@@ -4,10 +4,10 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from support.synthetic import DECAY, FIELD, decaying, with_states
 
 from echelon.sim.results.block_series import Blocks, BlockSeries, block_series, component_names
 from echelon.sim.results.trace import Trace
+from support.synthetic import DECAY, FIELD, decaying, with_states
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
-from support.runs import ROOT, echelon, summary_of
 
 from echelon.sim.results.rendering import json_text, read_summary, summary_schema, to_json
+from support.runs import ROOT, echelon, summary_of
 
 PUBLISHED = ROOT / "docs" / "summary.schema.json"
 

@@ -5,16 +5,26 @@ from math import exp, log, sqrt
 
 import numpy as np
 import pytest
-from support.synthetic import DECAY, FIELD, at_places, can_report, decaying, link_counts, of_states, run_facts, with_states
 
 from echelon.bridge.reports import BusEvent, BusReport, FindingReport, RefereeReport, ScheduledEvent
-from echelon.sim.results.can_lines import can_lines, can_reasons
+from echelon.sim.results.can_lines import can_lines, finding_text
 from echelon.sim.results.distances import distances
 from echelon.sim.results.measures import settling_ns
 from echelon.sim.results.records import Summary
 from echelon.sim.results.rendering import json_text, read_summary, write_summary
 from echelon.sim.results.summary import summarise, summary_text
 from echelon.sim.results.trace import Trace
+from support.synthetic import (
+    DECAY,
+    FIELD,
+    at_places,
+    can_report,
+    decaying,
+    link_counts,
+    of_states,
+    run_facts,
+    with_states,
+)
 
 NO_CLAIMS = "claims=[]"
 MS = 1_000_000
@@ -335,4 +345,4 @@ def test_what_was_on_schedule_and_who_went_bus_off_is_told():
     lines = [" ".join(line.split()) for line in can_lines(can)]
     assert lines[0].startswith("CAN 7 frames, 4 lost, 2 destroyed and sent again")
     assert lines[1:3] == ["events 2 s estop", "bus-off bridge at 2.5 s"]
-    assert can_reasons(can) == ["referee: 1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"]
+    assert finding_text(referee) == ["referee: 1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"]

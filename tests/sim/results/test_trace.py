@@ -6,10 +6,10 @@ import random
 
 import numpy as np
 import pytest
-from support.invented import invented, paper
 
 from echelon.messages import STATE_FIELDS, Channel
 from echelon.sim.results.trace import Digest, Trace, TraceBuilder
+from support.invented import invented, paper
 
 FIELDS = len(STATE_FIELDS)
 

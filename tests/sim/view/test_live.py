@@ -6,15 +6,15 @@ import io
 
 import numpy as np
 import pytest
-from support.runs import plan_of
 
 from echelon.bridge.reports import BridgeProgress
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
+from echelon.sim.processes.supervisor import Progress
 from echelon.sim.view import live
 from echelon.sim.view.live import Display
-from echelon.sim.processes.supervisor import Progress
+from support.runs import plan_of
 
 PLAN = plan_of("paper")
 

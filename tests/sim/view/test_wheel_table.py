@@ -8,19 +8,19 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from support.runs import echelon, plan_of, start_echelon, until
 
 from echelon.bridge.can.bus import open_bus
-from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.bridge.can.canlog import read_log
 from echelon.bridge.protocols.cyclic import WheelState
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.native.codec import FaultCode, Feedback, NativeCodec, Status, encode_status
 from echelon.bridge.referee.referee import Referee
+from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.cli import main
 from echelon.cli.listening import show_live
 from echelon.sim.view.wheel_table import HALF, CanTable, Rate, bar
 from support.live_robot import TORQUES, LiveRobot, one_robot
+from support.runs import echelon, plan_of, start_echelon, until
 
 MS = 1_000_000
 ON, FAULT = WheelState.ENABLED, WheelState.FAULT

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.invented import METADATA, invented, paper
 
+from echelon.bridge.frame_message import TimedFrame, pack
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import TimedFrame, pack
 from echelon.messages import Channel, Message
-from echelon.sim.recording.mcap_reader import watchers
-from echelon.sim.recording.mcap_reader import read_metadata, read_trace
-from echelon.sim.recording.watchers import Reception, RunRecorder
 from echelon.runtime.wire import encode, join
+from echelon.sim.processes import watchers
+from echelon.sim.processes.watchers import Reception, RunRecorder
+from echelon.sim.recording.mcap_reader import read_metadata, read_trace
+from support.invented import METADATA, invented, paper
 
 TICKS = 6
 

@@ -11,18 +11,18 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from echelon.bridge.roles.frame_message import unpack
-from echelon.plan.layout import said_by
-from echelon.runtime.link import LinkCounts
+from echelon.bridge.frame_message import unpack
 from echelon.messages import Channel, Message
+from echelon.plan.layout import said_by
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Inbox, Session
-from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
-from echelon.sim.recording.recorder import Recorder
-from echelon.sim.results.trace import TraceBuilder
-from echelon.sim.recording.time_order import TimeOrder, speakers
-from echelon.sim.processes.to_supervisor import RecorderProgress, RecorderReport
 from echelon.runtime.wire import WireError, count_refusal, decode, split, watch_key
+from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
+from echelon.sim.processes.to_supervisor import RecorderProgress, RecorderReport
+from echelon.sim.recording.recorder import Recorder
+from echelon.sim.recording.time_order import TimeOrder, speakers
+from echelon.sim.results.trace import TraceBuilder
 
 PROGRESS_S: Final = 0.2
 SLACK_NS: Final = 60_000_000_000

@@ -8,15 +8,15 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.runs import SCENARIOS, echelon, kill_session, plan_of, session_members, start_echelon, summary_of, until
 
 from echelon.bridge.can.canlog import read_log
 from echelon.planning.loading import effective_toml
-from echelon.sim.recording.mcap_writer import MAGIC
 from echelon.sim.parts.loading import load
-from echelon.sim.recording.recorder import Recorder
 from echelon.sim.recording.mcap_reader import CutError, read_trace
+from echelon.sim.recording.mcap_writer import MAGIC
+from echelon.sim.recording.recorder import Recorder
 from echelon.sim.run_folder import open_run
+from support.runs import SCENARIOS, echelon, kill_session, plan_of, session_members, start_echelon, summary_of, until
 
 ENOUGH = 300_000
 """Bytes of a recording that hold a good many states"""

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from echelon.scenario.part_fields import parts_in
 from echelon.plugins import Source
+from echelon.scenario.part_fields import parts_in
 from echelon.scenario.tables import Scenario
 from echelon.sim.results.records import PartResult
 

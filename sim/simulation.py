@@ -6,17 +6,17 @@ from typing import Any, Final
 import numpy as np
 
 from echelon.errors import UserError
-from echelon.plan.layout import acceleration_of
 from echelon.messages import STATE_FIELDS, Channel, Heard, Message
+from echelon.plan.layout import acceleration_of
 from echelon.plan.plan import NodePlan
+from echelon.runtime.turns import Turn
 from echelon.sim.engines.in_process import Engine, Row
+from echelon.sim.finished_run import Records, Run
 from echelon.sim.notebook import AnyScenario, load
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.records import RunFacts
-from echelon.sim.results.run import Records, Run
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Array, TraceBuilder
-from echelon.runtime.turns import Turn
 
 _STATE: Final = np.dtype([("robot", "U64"), *((name, "f8") for name in STATE_FIELDS)])
 

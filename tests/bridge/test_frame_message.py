@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from echelon.bridge.frame_message import TimedFrame, pack, unpack
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.roles.frame_message import TimedFrame, pack, unpack
 
 frames = st.builds(
     TimedFrame,

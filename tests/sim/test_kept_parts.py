@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from support.runs import SCENARIOS, echelon, summary_of
 
 from echelon.planning.loading import effective_toml
-from echelon.sim.parts.kept_parts import keep_parts
+from echelon.sim.kept_parts import keep_parts
 from echelon.sim.parts.loading import load, parse
 from echelon.sim.recording.mcap_reader import read_metadata, recover
+from support.runs import SCENARIOS, echelon, summary_of
 
 LAW = """
 from echelon.controller.laws import Law

@@ -9,12 +9,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from echelon.bridge.timing.bus_load import BitCount
-from echelon.bridge.timing.buses import scheduled
-from echelon.bridge.timing.fit import plan_fit
 from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.referee.referee import read_run_log
 from echelon.bridge.reports import BusReport, CanReport
+from echelon.bridge.timing.bus_load import BitCount
+from echelon.bridge.timing.buses import scheduled
+from echelon.bridge.timing.fit import plan_fit
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE

@@ -1,0 +1,21 @@
+"""One robot alone, and how fast errors grow."""
+
+import numpy as np
+
+from echelon.plan.plan import Array, Plan
+from support.trees import plan_of, scenario
+
+
+def single(T: float, lead: float = 0.0, k1: float = 1.0, k2: float = 1.0) -> Plan:
+    """Returns one robot alone: all there is is the centroid, with σ = 1."""
+    law = {"epsilon": [1.0], "lead": lead, "gains": [{"k1": k1, "k2": k2}]}
+    return plan_of(
+        scenario((None,), np.random.default_rng(1), duration=T, law=law, periods={"acceleration": T, "torque": T})
+    )
+
+
+def growth(norms: Array) -> float:
+    """Returns the logarithm of the growth per tick over the second half of a run, by its largest values."""
+    part = len(norms) // 8
+    early, late = norms[4 * part : 5 * part].max(), norms[-part:].max()
+    return float(np.log(late / early) / (len(norms) - 5 * part))

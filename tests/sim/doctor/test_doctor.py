@@ -11,8 +11,8 @@ import pytest
 
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import resolve_url
-from echelon.sim.doctor import can_checks
-from echelon.sim.doctor.doctor import Measured, doctor
+from echelon.sim.doctor import can_checks, doctor
+from echelon.sim.doctor.doctor import Measured
 from echelon.sim.doctor.finding import Finding
 from support.runs import echelon, plan_of
 

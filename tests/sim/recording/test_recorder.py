@@ -29,7 +29,8 @@ from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import mcap_reader as recording
 from echelon.sim.recording import mcap_writer as chunked
 from echelon.sim.recording.recorder import Recorder
-from support.invented import METADATA, ROOT, invented, paper
+from support.invented import METADATA, invented, paper
+from support.runs import ROOT
 
 SCENARIO = 'name = "invented"\n'
 LINKS = [

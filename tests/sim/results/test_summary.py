@@ -345,4 +345,4 @@ def test_what_was_on_schedule_and_who_went_bus_off_is_told():
     lines = [" ".join(line.split()) for line in can_lines(can)]
     assert lines[0].startswith("CAN 7 frames, 4 lost, 2 destroyed and sent again")
     assert lines[1:3] == ["events 2 s estop", "bus-off bridge at 2.5 s"]
-    assert finding_text(referee) == ["referee: 1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"]
+    assert finding_text(referee) == "1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"

@@ -32,7 +32,8 @@ def delay_margin(gains: LinearGains) -> float | None:
 
     def eigenvalues(omega: Array) -> NDArray[np.complex128]:
         w = omega[:, None, None]
-        return np.linalg.eigvals(((K_1 + 1j * w * K_2 + K_i / (1j * w)) / w**2).astype(np.complex128))
+        loop: NDArray[np.complex128] = (K_1 + 1j * w * K_2 + K_i / (1j * w)) / w**2
+        return np.asarray(np.linalg.eigvals(loop), dtype=np.complex128)
 
     high = sum(np.linalg.norm(matrix, 2) ** power for matrix, power in ((K_1, 1 / 2), (K_2, 1), (K_i, 1 / 3)))
     return smallest_delay(crossings(eigenvalues, SLOW * np.abs(found).min(), float(high)))  # beyond it |λ| ≤ ‖L‖ < 1

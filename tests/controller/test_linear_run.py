@@ -21,7 +21,7 @@ from echelon.controller.prediction.linear_run import LinearRun, later, ruled_lin
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.controller.trajectory import Line
 from echelon.messages import Channel
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.plan import Array, Plan
 from echelon.plugins import Part
 from echelon.sim.parts.loading import load
 from support.growth import growth, largest_delay_of, radius_of, single
@@ -237,10 +237,11 @@ TREE = ((None, None), (None, None, None))
 def with_links(plan: Plan, delays_ns: Sequence[int]) -> Plan:
     """Returns a plan whose links have these delays, one after the other."""
 
-    def late(link: LinkPlan, delay_ns: int) -> LinkPlan:
-        return replace(link, delay_min_ns=delay_ns, delay_max_ns=delay_ns)
-
-    return replace(plan, links=tuple(map(late, plan.links, delays_ns, strict=True)))
+    late = (
+        replace(link, delay_min_ns=delay_ns, delay_max_ns=delay_ns)
+        for link, delay_ns in zip(plan.links, delays_ns, strict=True)
+    )
+    return replace(plan, links=tuple(late))
 
 
 def check_points(plan: Plan, monkeypatch: pytest.MonkeyPatch, rel: float = 0.15) -> float:

@@ -32,7 +32,7 @@ def delay_margin(gains: LinearGains) -> float | None:
 
     def eigenvalues(omega: Array) -> NDArray[np.complex128]:
         w = omega[:, None, None]
-        loop: NDArray[np.complex128] = (K_1 + 1j * w * K_2 + K_i / (1j * w)) / w**2
+        loop = np.asarray((K_1 + 1j * w * K_2 + K_i / (1j * w)) / w**2, dtype=np.complex128)
         return np.asarray(np.linalg.eigvals(loop), dtype=np.complex128)
 
     high = sum(np.linalg.norm(matrix, 2) ** power for matrix, power in ((K_1, 1 / 2), (K_2, 1), (K_i, 1 / 3)))

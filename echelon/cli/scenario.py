@@ -87,13 +87,15 @@ def new(options: NewOptions) -> int:
 class ValidateOptions(ScenarioOptions):
     """Options of `echelon validate`."""
 
+    strict: bool = field(default=False, metadata=option("warnings count as mistakes: exit code 2"))
     json: bool = field(default=False, metadata=JSON)
 
 
 def validate(options: ValidateOptions) -> int:
-    """Checks a scenario and says what it means."""
+    """Checks a scenario, says what it means, and warns of what is hardly meant."""
     from echelon.bridge.timing.fit import describe_fit
     from echelon.cli.scenario_file import read_scenario
+    from echelon.sim.forecast.warnings import warnings
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
     facts: dict[str, Any] = {
@@ -104,16 +106,20 @@ def validate(options: ValidateOptions) -> int:
         "ticks": plan.duration_ns // plan.robots[0].period_ns,
         "time_scales": {block.name: block.sigma for block in plan.blocks},
         "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
+        "warnings": warnings(plan),
     }
+    code = 2 if options.strict and facts["warnings"] else 0
     if options.json:
-        print(json.dumps(facts, indent=2))
-        return 0
+        print(json.dumps(facts, indent=2, ensure_ascii=False))
+        return code
     print(f"{options.scenario}: valid")
     print(f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks")
     print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
     for line in facts["can"]:
         print(f"  CAN  {line}")
-    return 0
+    for line in facts["warnings"]:
+        print(f"  warning  {line}")
+    return code
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,13 +209,16 @@ what each part is for.  Then change it: `echelon validate NAME.toml` says what i
         work=validate,
         about="""\
 Checks a scenario.  Says what it means: robots, duration, time scales, whether its frames fit
-its CAN buses; or all that is wrong with it, a line each: key, value, and what is allowed.""",
+its CAN buses; or all that is wrong with it, a line each: key, value, and what is allowed.
+Warns, a line each, of what is allowed but hardly meant: time scales near the period, more
+torque or speed than robots have, claims beyond the end, delays that act as longer ones.""",
         examples={
             "echelon validate lab": "a shipped scenario",
             "echelon validate my.toml --set law.lead=0.5": "a file with one value changed",
+            "echelon validate my.toml --strict": "fails if there is a warning",
             "echelon validate runs/demo --json": "the scenario of a run, for scripts",
         },
-        codes={0: "valid"},
+        codes={0: "valid", 2: "wrong; with --strict also: there are warnings"},
     ),
     ANALYSE,
     Command(

@@ -1,0 +1,33 @@
+"""Warnings about the law and its periods: time scales near the period, and a loop that does not settle as it is sampled."""
+
+from typing import Final
+
+from echelon.controller.prediction.gains import PredictionError
+from echelon.controller.prediction.linear_run import LinearRun
+from echelon.controller.prediction.spectrum import spectral_radius
+from echelon.plan.plan import Plan
+
+FEWEST: Final = 5
+"""Periods that a time scale should last: with fewer the law acts on what has long changed"""
+
+
+def sampling_warnings(plan: Plan) -> list[str]:
+    """Returns a line for each time scale near its period, and one if the loop with its links does not settle.
+
+    Of laws that are not linear, and of links that lose messages or have delays that vary, only the first is said."""
+    found = []
+    for block in plan.blocks:
+        node = plan.root if block.node is None else plan.formation[block.node]
+        period_s = node.period_ns / 1e9
+        if block.size and block.sigma < FEWEST * period_s * (1 - 1e-9):
+            found.append(
+                f"law.epsilon: σ of {block.name} is {block.sigma:g} s, {block.sigma / period_s:.2g} × the period of "
+                f"{period_s:g} s; it should be {FEWEST} × that at least"
+            )
+    try:
+        radius = spectral_radius(LinearRun(plan).map())
+    except PredictionError:
+        return found
+    if radius >= 1:
+        found.append("law: with these periods and links the formation does not settle (`echelon analyse` says more)")
+    return found

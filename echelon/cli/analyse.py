@@ -26,17 +26,20 @@ def analyse(options: AnalyseOptions) -> int:
     from echelon.cli.scenario_file import read_scenario
     from echelon.controller.prediction.analysis import analyse as analysis_of
     from echelon.controller.prediction.gains import PredictionError
+    from echelon.sim.forecast.motion import asked_of, torque_loop_diverges, torque_loop_warnings
 
     _, plan = read_scenario(options.scenario, options.overrides)
     try:
         found = analysis_of(plan)
     except PredictionError as error:
         raise UsageError(f"{options.scenario}: cannot be analysed, only run: {error}") from None
+    asked = asked_of(plan)
+    diverges, warnings = torque_loop_diverges(plan, asked), torque_loop_warnings(plan, asked)
     if options.json:
-        print(json.dumps({"scenario": plan.name, **_facts(found)}, indent=2))
+        print(json.dumps({"scenario": plan.name, **_facts(found), "torque_loop_diverges": diverges}, indent=2))
     else:
-        print("\n".join(_lines(plan.name, found, closed=plan.can.closed)))
-    return 0 if found.settles else 1
+        print("\n".join(_lines(plan.name, found, warnings, closed=plan.can.closed, diverges=diverges)))
+    return 0 if found.settles and not diverges else 1
 
 
 def _facts(found: "Analysis") -> dict[str, Any]:
@@ -56,7 +59,7 @@ def _facts(found: "Analysis") -> dict[str, Any]:
     }
 
 
-def _lines(name: str, found: "Analysis", *, closed: bool) -> list[str]:
+def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: bool, diverges: bool) -> list[str]:
     """Returns what was found, for people."""
     channels = _enumeration([channel.name.lower() for channel in found.delays])
     accelerations, torques = (_ms(periods) for periods in (found.acceleration_periods, found.torque_periods))
@@ -81,7 +84,8 @@ def _lines(name: str, found: "Analysis", *, closed: bool) -> list[str]:
     step = f"spectral radius {found.radius:.6f} over {_ms([found.hyperperiod])}"
     outcome = "settles; errors shrink" if found.settles else "does not settle; errors grow"
     lines.append(f"  all together, with these delays: {outcome} e-fold in {found.time_constant:.3g} s ({step})")
-    if not found.settles:
+    lines += [f"  but {each}" for each in warnings]
+    if diverges or not found.settles:
         return lines
     if found.centroid_age > 0:
         lines.append(
@@ -124,12 +128,13 @@ ANALYSE: Final = Command(
     about="""\
 Computes, without a run, whether the formation settles with the periods and the constant delays
 of the scenario's links, and how much later all messages of a channel may be until it does not.
-Robots are taken to do what accelerations ask.  Links that lose messages or have delays that
-vary, and laws that are not linear, are refused: run those.""",
+Robots are taken to do what accelerations ask; a torque loop that is too slow for that is said.
+Links that lose messages or have delays that vary, and laws that are not linear, are refused:
+run those.""",
     examples={
         "echelon analyse paper": "states may be up to 6 ms late",
         "echelon analyse lab --set 'links=[{channel=\"state\",delay=0.3}]'": "with a delay",
         "echelon analyse lab --json": "for scripts",
     },
-    codes={0: "it settles", 1: "it does not settle"},
+    codes={0: "it settles", 1: "it does not settle, or a torque loop diverges"},
 )

@@ -183,7 +183,7 @@ class Law(Table):
     """Of the law that `use` names"""  # validated, they are the law itself, a Part
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
-    epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
+    epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.7, 0.7]
     """ε1, ε2, …: each block's σ is a product of the first ones; as many as the tree has layers, or with `multi` groups
     and the formation"""
     gains: list[Gains] = []

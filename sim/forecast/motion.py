@@ -107,6 +107,11 @@ def torque_loop_warnings(plan: Plan, asked: Asked) -> list[str]:
     ]
 
 
+def torque_loop_diverges(plan: Plan, asked: Asked) -> bool:
+    """True if the torque loop of some robot diverges at the speed that is asked of it."""
+    return max(torque_loop_numbers(plan, asked)) >= EDGE
+
+
 def torque_loop_numbers(plan: Plan, asked: Asked) -> list[float]:
     """Returns q = h v/d of each robot at the speed that is asked of it."""
     return [
@@ -125,5 +130,5 @@ def _start_torque(robot: RobotPlan, ax: float, ay: float) -> float:
 
 
 def _named(plan: Plan, worst: int, count: int) -> str:
-    """Returns a robot's name, and how many more there are."""
-    return plan.robots[worst].name + (f" (and too much of {count - 1} more)" if count > 1 else "")
+    """Returns a robot's name, and of how many it is the worst."""
+    return plan.robots[worst].name + (f" (the worst of {count} robots)" if count > 1 else "")

@@ -14,8 +14,10 @@ from echelon.controller.prediction.gains import PredictionError
 
 DENSE: Final = 600
 """Up to this size all eigenvalues of a part are computed"""
-LARGE: Final = 4000
+LARGE: Final = 2000
 """Up to this size all of them are computed where the outermost do not converge"""
+LARGEST: Final = 6000
+"""A part that is larger is refused"""
 OUTERMOST: Final = 8
 VECTORS: Final = 120
 """Of the Krylov space: many, for eigenvalues that come of delays lie close together"""
@@ -49,6 +51,8 @@ def _radius(part: csr_array) -> float:
     size = part.shape[0]
     if size <= DENSE:
         return float(np.abs(eigvals(part.toarray())).max())
+    if size > LARGEST:
+        raise _too_large(size)
     found = [0.0]
     for start in range(STARTS):
         vector = np.random.default_rng(start).normal(size=size)
@@ -56,7 +60,13 @@ def _radius(part: csr_array) -> float:
             values = eigs(part, OUTERMOST, ncv=VECTORS, v0=vector, tol=1e-12, return_eigenvectors=False)
         except ArpackNoConvergence:
             if size > LARGE:
-                raise PredictionError(f"too many messages on their way: {size} numbers act on each other") from None
+                raise _too_large(size) from None
             return float(np.abs(eigvals(part.toarray())).max())
         found.append(float(np.abs(values).max()))
     return max(found)
+
+
+def _too_large(size: int) -> PredictionError:
+    return PredictionError(
+        f"delays are so long that {size} numbers on their way act on each other, too many to compute with"
+    )

@@ -10,11 +10,15 @@ from echelon.plan.plan import Plan
 FEWEST: Final = 5
 """Periods that a time scale should last: with fewer the law acts on what has long changed"""
 
+LARGE: Final = 2000
+"""Size of the run's map up to which it is computed: a warning must not take long"""
+
 
 def sampling_warnings(plan: Plan) -> list[str]:
     """Returns a line for each time scale near its period, and one if the loop with its links does not settle.
 
-    Of laws that are not linear, and of links that lose messages or have delays that vary, only the first is said."""
+    Of laws that are not linear, of links that lose messages or have delays that vary, and of very long delays, only the first
+    is said."""
     found = []
     for block in plan.blocks:
         node = plan.root if block.node is None else plan.formation[block.node]
@@ -25,9 +29,9 @@ def sampling_warnings(plan: Plan) -> list[str]:
                 f"{period_s:g} s; it should be {FEWEST} × that at least"
             )
     try:
-        radius = spectral_radius(LinearRun(plan).map())
+        run = LinearRun(plan)
     except PredictionError:
         return found
-    if radius >= 1:
+    if run.size <= LARGE and spectral_radius(run.map()) >= 1:
         found.append("law: with these periods and links the formation does not settle (`echelon analyse` says more)")
     return found

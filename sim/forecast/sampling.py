@@ -15,19 +15,11 @@ LARGE: Final = 2000
 
 
 def sampling_warnings(plan: Plan) -> list[str]:
-    """Returns a line for each time scale near its period, and one if the loop with its links does not settle.
+    """Returns a line if time scales are near the period, and one if the loop with its links does not settle.
 
     Of laws that are not linear, of links that lose messages or have delays that vary, and of very long delays, only the first
     is said."""
-    found = []
-    for block in plan.blocks:
-        node = plan.root if block.node is None else plan.formation[block.node]
-        period_s = node.period_ns / 1e9
-        if block.size and block.sigma < FEWEST * period_s * (1 - 1e-9):
-            found.append(
-                f"law.epsilon: σ of {block.name} is {block.sigma:g} s, {block.sigma / period_s:.2g} × the period of "
-                f"{period_s:g} s; it should be {FEWEST} × that at least"
-            )
+    found = _near_the_period(plan)
     try:
         run = LinearRun(plan)
     except PredictionError:
@@ -35,3 +27,20 @@ def sampling_warnings(plan: Plan) -> list[str]:
     if run.size <= LARGE and spectral_radius(run.map()) >= 1:
         found.append("law: with these periods and links the formation does not settle (`echelon analyse` says more)")
     return found
+
+
+def _near_the_period(plan: Plan) -> list[str]:
+    """Returns a line if time scales are near the period of their node: about the one that is nearest."""
+    periods = {
+        block.name: (plan.root if block.node is None else plan.formation[block.node]).period_ns / 1e9
+        for block in plan.blocks
+    }
+    near = [block for block in plan.blocks if block.size and block.sigma < FEWEST * periods[block.name] * (1 - 1e-9)]
+    if not near:
+        return []
+    worst = min(near, key=lambda block: block.sigma / periods[block.name])
+    period_s, of = periods[worst.name], f" (the shortest of {len(near)})" if len(near) > 1 else ""
+    return [
+        f"law.epsilon: σ of {worst.name}{of} is {worst.sigma:g} s, {worst.sigma / period_s:.2g} × the period of {period_s:g} s; "
+        f"it should be {FEWEST} × that at least"
+    ]

@@ -40,7 +40,5 @@ def _near_the_period(plan: Plan) -> list[str]:
         return []
     worst = min(near, key=lambda block: block.sigma / periods[block.name])
     period_s, of = periods[worst.name], f" (the shortest of {len(near)})" if len(near) > 1 else ""
-    return [
-        f"law.epsilon: σ of {worst.name}{of} is {worst.sigma:g} s, {worst.sigma / period_s:.2g} × the period of {period_s:g} s; "
-        f"it should be {FEWEST} × that at least"
-    ]
+    times = f"{worst.sigma / period_s:.2g} × the period of {period_s:g} s"
+    return [f"law.epsilon: σ of {worst.name}{of} is {worst.sigma:g} s, {times}; it should be {FEWEST} × that at least"]

@@ -70,9 +70,9 @@ def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_millisecon
 
 
 def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
-    """A new scenario with 0.1 s on every link does not settle, nor does it when it is run; with a third of that it does both."""
+    """A new scenario with 0.2 s on every link does not settle, nor does its run; with half of that both do."""
     text = scenario_text("new", sizes("2x3"), None)
-    for delay, settles in ((0.1, False), (0.03, True)):
+    for delay, settles in ((0.2, False), (0.1, True)):
         rule = f"links=[{{delay={delay}}}]"
         done = echelon("analyse", "-", "--set", rule, "--json", typed=text)
         facts = json.loads(done.stdout)
@@ -90,8 +90,8 @@ def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
             "robot.wheel_speed_limit=inf",
         )
         assert (ends[-1] < 0.1 * ends[0]) == settles, ends
-    lines = echelon("analyse", "-", "--set", "links=[{delay=0.1}]", typed=text).stdout.splitlines()
-    assert "state 100 ms, group_state 100 ms, reference 100 ms, command 100 ms" in lines[1]
+    lines = echelon("analyse", "-", "--set", "links=[{delay=0.2}]", typed=text).stdout.splitlines()
+    assert "state 200 ms, group_state 200 ms, reference 200 ms, command 200 ms" in lines[1]
     assert "does not settle; errors grow e-fold in" in lines[-1]
     assert not any("may be later" in line for line in lines)
 

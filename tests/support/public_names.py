@@ -1,5 +1,6 @@
 """What others may rely on, as a page: `make docs` writes docs/public-names.md, a test holds it against the code."""
 
+import ast
 import inspect
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Iterator
@@ -10,12 +11,13 @@ from echelon.messages import Channel
 from echelon.plugins import Plugin
 from echelon.sim.parts.loading import REGISTRY
 from echelon.sim.run import FILES
+from support.runs import ROOT
 
 HEAD = """\
 # Public names
 
-What others may rely on, made from the code by `make docs`. A test fails when one of these names changes unnoticed. The keys of a
-scenario are in [scenario.md](scenario.md), those of `summary.json` in [summary.schema.json](summary.schema.json); both are made
+What others may rely on, made from the code by `make docs`. A test fails when one of these names changes unnoticed.
+The keys of a scenario are in [scenario.md](scenario.md), those of `summary.json` in [summary.schema.json](summary.schema.json); both are made
 and tested in the same way. What is in neither of these pages is internal and may change.
 """
 
@@ -25,6 +27,7 @@ def page() -> str:
     sections = {
         "In Python: `import echelon`": _python(),
         "Parts": _parts(),
+        "What parts import": _imports(),
         "Commands": _commands(),
         "Exit codes": _exit_codes(),
         "Files of a run": (f"- `{name}`" for name in FILES),
@@ -75,6 +78,16 @@ def _parts() -> Iterator[str]:
     for name, group in REGISTRY.groups.items():
         assert all(issubclass(part, getattr(echelon, bases[name])) for part in group.built_in.values())
         yield f"| `echelon.{name}` | `echelon.{bases[name]}` | {', '.join(f'`{part}`' for part in group.built_in)} |"
+
+
+def _imports() -> Iterator[str]:
+    """Yields what the examples of parts import: authors of parts need these modules, too."""
+    found: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("echelon."):
+                found.setdefault(str(node.module), set()).update(name.name for name in node.names)
+    yield from (f"- `{module}`: {', '.join(f'`{name}`' for name in sorted(found[module]))}" for module in sorted(found))
 
 
 def _commands() -> Iterator[str]:

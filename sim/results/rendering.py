@@ -11,6 +11,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from echelon.files import write_text
 from echelon.sim.results.records import Summary
 
 
@@ -34,7 +35,7 @@ def json_text(value: Any) -> str:
 
 def write_summary(summary: Summary, path: Path) -> None:
     """Writes summary.json.  Raises OSError."""
-    path.write_text(json_text(summary) + "\n", encoding="utf-8")
+    write_text(path, json_text(summary) + "\n")
 
 
 def read_summary(path: Path) -> Summary:

@@ -18,13 +18,18 @@ def test_a_file_is_written_anew(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def fail(path: Path, error: BaseException) -> None:
+    with replacing(path) as partial:
+        partial.write_text("half")
+        raise error
+
+
 @pytest.mark.parametrize("error", [OSError("no"), KeyboardInterrupt(), ValueError()])
 def test_what_fails_leaves_the_file_as_it_was(error: BaseException, tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("before")
-    with pytest.raises(type(error)) as raised, replacing(path) as partial:
-        partial.write_text("half")
-        raise error
+    with pytest.raises(type(error)) as raised:
+        fail(path, error)
     if isinstance(raised.value, OSError):
         assert raised.value.filename == str(path)
     assert path.read_text() == "before"

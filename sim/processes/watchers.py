@@ -13,7 +13,7 @@ from typing import Final
 
 from echelon.bridge.frame_message import unpack
 from echelon.messages import Channel, Message
-from echelon.plan.layout import said_by
+from echelon.plan.layout import message_sizes
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Inbox, Session
@@ -41,7 +41,7 @@ class Reception:
     def __init__(self, inbox: Inbox, sources: Iterable[int], plan: Plan) -> None:
         self._inbox = inbox
         self._order = TimeOrder(sources)
-        self._sizes = said_by(plan)
+        self._sizes = message_sizes(plan)
         self._from_ns, self._until_ns = -plan.can.bring_up_ns, plan.duration_ns + SLACK_NS
         self.refused: dict[str, int] = {}
 

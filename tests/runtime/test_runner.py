@@ -18,7 +18,7 @@ import echelon.runtime.runner
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
-from echelon.runtime.mailbox import LEAD
+from echelon.runtime.mailbox import MAX_AHEAD
 from echelon.runtime.runner import MAX_BATCHES, Runner
 from echelon.runtime.session import Receive
 from echelon.runtime.wire import data_key, decode, encode, split
@@ -311,7 +311,7 @@ def test_a_role_whose_links_lose_everything_still_waits_for_its_sources(
     member = Member(plan, make_role(plan, robot.index))
     member.thread.start()
     assert member.waiting.wait(TIMEOUT_S)
-    assert LEAD <= len(member.said) <= LEAD + 2
+    assert MAX_AHEAD <= len(member.said) <= MAX_AHEAD + 2
     assert member.waits[0][1] == [robot.parent]
     for command in of(messages, robot.parent, Channel.COMMAND):
         member.receive(command)

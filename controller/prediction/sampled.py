@@ -1,4 +1,4 @@
-"""Exact stability of the sampled, delayed loop (theory.md section 5): what period, hold and delay leave of the law.
+"""Exact stability of the sampled, delayed loop (docs/architecture.md, 2.7): what period, hold and delay leave of the law.
 
 Between ticks every block is a double integrator under a held η = Z̈_b - Z̈_bd; with e_n = e(nT) and ė_n = ė(nT)
 

@@ -138,7 +138,7 @@ def test_paper_bears_six_milliseconds_and_not_seven():
 
 
 @pytest.mark.parametrize("sigma", [1.0, 0.1, 0.01])
-def test_margin_of_the_theory_page(sigma):
+def test_margin_of_the_architecture_page(sigma):
     assert delay_margin(1 / sigma**2, 1 / sigma) == pytest.approx(0.7112 * sigma, rel=2e-4)
 
 

@@ -35,7 +35,7 @@ _ERROR_BITS: Final = 23
 """Of the longest error frame and the pause after it"""
 
 
-class Watch:
+class Deadline:
     """One identifier: whose it is, its period (0: it comes as it likes), when it is due."""
 
     __slots__ = (
@@ -186,7 +186,7 @@ class Watch:
         )
 
 
-class Lane:
+class BusTraffic:
     """One bus: how long its frames take at most, when the present stretch of frames began, what to look for."""
 
     def __init__(self, plan: Plan, bus: int) -> None:
@@ -197,30 +197,30 @@ class Lane:
         self.last_ns = -NEVER_NS
         self.busy_ns = -NEVER_NS
         self.scan_ns = -NEVER_NS
-        self.watches: dict[int, Watch] = {}
+        self.deadlines: dict[int, Deadline] = {}
         """By identifier"""
-        self.boot_ups: dict[tuple[int, bytes], list[Watch]] = {}
+        self.boot_ups: dict[tuple[int, bytes], list[Deadline]] = {}
         """What begins anew with a frame, by its identifier and data"""
 
-    def add(self, can_id: int, period_ns: int, tolerance_ns: int | None = None) -> Watch:
-        """Returns the watch of an identifier, a new one if there is none; period 0: it comes as it likes."""
-        watch = self.watches.get(can_id)
-        if watch is None:
-            watch = self.watches[can_id] = Watch(can_id, period_ns, tolerance_ns)
+    def add(self, can_id: int, period_ns: int, tolerance_ns: int | None = None) -> Deadline:
+        """Returns the deadline of an identifier, a new one if there is none; period 0: it comes as it likes."""
+        deadline = self.deadlines.get(can_id)
+        if deadline is None:
+            deadline = self.deadlines[can_id] = Deadline(can_id, period_ns, tolerance_ns)
             if self.disturbed:
-                watch.shift_ns = NEVER_NS
-        return watch
+                deadline.shift_ns = NEVER_NS
+        return deadline
 
     def add_boot_ups(self, boot_ups: Mapping[tuple[int, bytes], frozenset[int]]) -> None:
         """Takes note of frames with which identifiers begin anew."""
         for frame, can_ids in boot_ups.items():
-            self.boot_ups[frame] = [self.watches[can_id] for can_id in sorted(can_ids) if can_id in self.watches]
+            self.boot_ups[frame] = [self.deadlines[can_id] for can_id in sorted(can_ids) if can_id in self.deadlines]
 
     @property
     def first_ns(self) -> int | None:
         """When the first known frame came."""
-        return min((watch.first_ns for watch in self.watches.values() if watch.frames), default=None)
+        return min((deadline.first_ns for deadline in self.deadlines.values() if deadline.frames), default=None)
 
-    def cyclic(self) -> list[Watch]:
+    def cyclic(self) -> list[Deadline]:
         """Identifiers that must come regularly."""
-        return [watch for watch in self.watches.values() if watch.period_ns]
+        return [deadline for deadline in self.deadlines.values() if deadline.period_ns]

@@ -30,7 +30,7 @@ from echelon.bridge.can.canlog import read_log
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.observe import Finding, Observer
 from echelon.bridge.protocols.registry import protocol_of, shared_cyclic
-from echelon.bridge.referee.deadlines import Lane
+from echelon.bridge.referee.deadlines import BusTraffic
 from echelon.bridge.referee.wheel_check import WheelCheck
 from echelon.bridge.reports import FindingReport, RefereeReport
 from echelon.plan.can_plan import NEVER_NS
@@ -65,18 +65,18 @@ class Referee:
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
         self._late = late
         self._silence_ns = plan.can.watchdog_ns
-        self._lanes = [Lane(plan, bus) for bus in range(len(plan.can.buses))]
+        self._buses = [BusTraffic(plan, bus) for bus in range(len(plan.can.buses))]
         for robot in self.robots:
-            lane = self._lanes[robot.plan.drive.bus]
+            traffic = self._buses[robot.plan.drive.bus]
             for can_id in sorted(robot.observer.identifiers):
-                watch = lane.add(can_id, robot.cyclic.get(can_id, 0), tolerance_ns)
-                watch.robots += (robot,)
-                watch.asked_empty = plan.can.closed and protocol_of(robot.plan).empty_asks
+                deadline = traffic.add(can_id, robot.cyclic.get(can_id, 0), tolerance_ns)
+                deadline.robots += (robot,)
+                deadline.asked_empty = plan.can.closed and protocol_of(robot.plan).empty_asks
         if plan.can.closed:
             for bus, can_id, period_ns in shared_cyclic(plan):
-                self._lanes[bus].add(can_id, period_ns, tolerance_ns)
+                self._buses[bus].add(can_id, period_ns, tolerance_ns)
             for robot in self.robots:
-                self._lanes[robot.plan.drive.bus].add_boot_ups(protocol_of(robot.plan).boot_ups(robot.plan.drive))
+                self._buses[robot.plan.drive.bus].add_boot_ups(protocol_of(robot.plan).boot_ups(robot.plan.drive))
 
     @property
     def observers(self) -> list[Observer]:
@@ -87,37 +87,37 @@ class Referee:
         """Takes a frame of bus number `bus`; returns what is wrong with it, or shows by its time to be missing.
 
         Raises ValueError for a bus that the plan does not have."""
-        if not 0 <= bus < len(self._lanes):
-            raise ValueError(f"bus must be 0 .. {len(self._lanes) - 1}, not {bus!r}")
-        lane = self._lanes[bus]
+        if not 0 <= bus < len(self._buses):
+            raise ValueError(f"bus must be 0 .. {len(self._buses) - 1}, not {bus!r}")
+        traffic = self._buses[bus]
         self.frames += 1
         said: list[Finding] = []
-        if time_ns < lane.last_ns:
-            text = f"{(lane.last_ns - time_ns) / 1e6:g} ms before the frame before it"
+        if time_ns < traffic.last_ns:
+            text = f"{(traffic.last_ns - time_ns) / 1e6:g} ms before the frame before it"
             said.append(self._tell(bus, None, Finding(time_ns, frame.can_id, "time", text)))
-            time_ns = lane.last_ns
-        begin_ns = time_ns - lane.durations_ns[min(len(frame.data), 8)]
-        if begin_ns > lane.last_ns + lane.pause_ns:
-            lane.busy_ns = begin_ns
-        lane.last_ns = time_ns
-        if time_ns >= lane.scan_ns:
-            lane.scan_ns = time_ns + SCAN_NS
+            time_ns = traffic.last_ns
+        begin_ns = time_ns - traffic.durations_ns[min(len(frame.data), 8)]
+        if begin_ns > traffic.last_ns + traffic.pause_ns:
+            traffic.busy_ns = begin_ns
+        traffic.last_ns = time_ns
+        if time_ns >= traffic.scan_ns:
+            traffic.scan_ns = time_ns + SCAN_NS
             if time_ns >= 0:
                 said += self._scan(time_ns, bus, frame.can_id)
-        watch = lane.watches.get(frame.can_id)
-        if watch is None:
+        deadline = traffic.deadlines.get(frame.can_id)
+        if deadline is None:
             self.unknown += 1
             return said
-        untimely = watch.take(time_ns, begin_ns, lane.busy_ns, frame)
-        if lane.boot_ups and (anew := lane.boot_ups.get((frame.can_id, frame.data))):
+        untimely = deadline.take(time_ns, begin_ns, traffic.busy_ns, frame)
+        if traffic.boot_ups and (anew := traffic.boot_ups.get((frame.can_id, frame.data))):
             untimely = None
             for other in anew:
                 other.forget()
-        sampled_ns = max(lane.busy_ns, time_ns - WAIT_NS)
-        for robot in watch.robots:
+        sampled_ns = max(traffic.busy_ns, time_ns - WAIT_NS)
+        for robot in deadline.robots:
             found = robot.observer.observe(time_ns, frame)
             for finding in found:
-                unheard = self._late and watch.frames == 1 and finding.kind == "enabled unasked"
+                unheard = self._late and deadline.frames == 1 and finding.kind == "enabled unasked"
                 waited = finding.kind == "torque after silence" and not robot.silent(sampled_ns)
                 if not unheard and not waited:
                     said.append(self._tell(bus, robot, finding))
@@ -128,31 +128,38 @@ class Referee:
                 if not any(finding.kind == kind for finding in found):
                     said.append(self._tell(bus, robot, Finding(time_ns, frame.can_id, kind, text)))
         if untimely is not None and time_ns >= 0:
-            said.append(self._tell(bus, watch.robot, Finding(time_ns, frame.can_id, *untimely)))
+            said.append(self._tell(bus, deadline.robot, Finding(time_ns, frame.can_id, *untimely)))
         return said
 
     def finish(self, time_ns: int) -> list[Finding]:
         """Ends it; returns which identifiers were silent at `time_ns`, or missing all the time."""
         said: list[Finding] = []
-        time_ns = max(time_ns, *(lane.last_ns for lane in self._lanes))
-        for lane in self._lanes:
-            if time_ns > lane.last_ns + lane.pause_ns:
-                lane.busy_ns = time_ns
-        begin_ns = min((lane.first_ns for lane in self._lanes if lane.first_ns is not None), default=-NEVER_NS)
-        for bus, lane in enumerate(self._lanes):
+        time_ns = max(time_ns, *(traffic.last_ns for traffic in self._buses))
+        for traffic in self._buses:
+            if time_ns > traffic.last_ns + traffic.pause_ns:
+                traffic.busy_ns = time_ns
+        begin_ns = min((traffic.first_ns for traffic in self._buses if traffic.first_ns is not None), default=-NEVER_NS)
+        for bus, traffic in enumerate(self._buses):
             said += self._scan(time_ns, bus, ended=True)
             unheard = {robot.name for robot in self.robots if robot.plan.drive.bus == bus} - {
-                robot.name for watch in lane.watches.values() if watch.frames for robot in watch.robots[:1]
+                robot.name
+                for deadline in traffic.deadlines.values()
+                if deadline.frames
+                for robot in deadline.robots[:1]
             }
-            for watch in lane.watches.values():
-                if not watch.period_ns or watch.frames or time_ns - begin_ns < 2 * watch.period_ns + watch.half_ns:
+            for deadline in traffic.deadlines.values():
+                if (
+                    not deadline.period_ns
+                    or deadline.frames
+                    or time_ns - begin_ns < 2 * deadline.period_ns + deadline.half_ns
+                ):
                     continue
-                robot, text = watch.robot, "never came"
+                robot, text = deadline.robot, "never came"
                 if robot is not None and robot.name in unheard:
-                    if watch.can_id != min(robot.cyclic):
+                    if deadline.can_id != min(robot.cyclic):
                         continue
                     text = "nothing came, of this identifier or any other of the robot's"
-                said.append(self._tell(bus, robot, Finding(time_ns, watch.can_id, "missing", text)))
+                said.append(self._tell(bus, robot, Finding(time_ns, deadline.can_id, "missing", text)))
         return said
 
     def report(self, source: str = "can.log") -> RefereeReport:
@@ -164,29 +171,29 @@ class Referee:
             kinds=dict(sorted(self.kinds.items())),
             findings=tuple(self.kept),
             identifiers={
-                f"{name}:{watch.can_id:03X}": watch.report()
-                for name, lane in zip(names, self._lanes, strict=True)
-                for watch in sorted(lane.watches.values(), key=lambda watch: watch.can_id)
-                if watch.frames
+                f"{name}:{deadline.can_id:03X}": deadline.report()
+                for name, traffic in zip(names, self._buses, strict=True)
+                for deadline in sorted(traffic.deadlines.values(), key=lambda deadline: deadline.can_id)
+                if deadline.frames
             },
             source=source,
         )
 
     def _scan(self, time_ns: int, bus: int, can_id: int | None = None, ended: bool = False) -> Iterator[Finding]:
         """Tells which cyclic identifiers are silent, but for the one that has just come."""
-        lane = self._lanes[bus]
-        for watch in lane.cyclic():
-            expected_ns = watch.expected_ns
-            if expected_ns is None or watch.silent or watch.can_id == can_id:
+        traffic = self._buses[bus]
+        for deadline in traffic.cyclic():
+            expected_ns = deadline.expected_ns
+            if expected_ns is None or deadline.silent or deadline.can_id == can_id:
                 continue
-            tolerance_ns = watch.tolerance_ns
+            tolerance_ns = deadline.tolerance_ns
             if not ended:
-                tolerance_ns = max(tolerance_ns, self._silence_ns + watch.period_ns)
-            late_ns = lane.busy_ns - expected_ns
+                tolerance_ns = max(tolerance_ns, self._silence_ns + deadline.period_ns)
+            late_ns = traffic.busy_ns - expected_ns
             if late_ns > tolerance_ns:
-                watch.silent = True
-                text = f"nothing for {(late_ns + watch.period_ns) / 1e6:.4g} ms, its period is {watch.period_ns / 1e6:g} ms"
-                yield self._tell(bus, watch.robot, Finding(time_ns, watch.can_id, "silent", text))
+                deadline.silent = True
+                text = f"nothing for {(late_ns + deadline.period_ns) / 1e6:.4g} ms, its period is {deadline.period_ns / 1e6:g} ms"
+                yield self._tell(bus, deadline.robot, Finding(time_ns, deadline.can_id, "silent", text))
 
     def _tell(self, bus: int, robot: WheelCheck | None, finding: Finding) -> Finding:
         self.kinds[finding.kind] += 1

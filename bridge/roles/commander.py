@@ -19,7 +19,7 @@ from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.protocols.registry import drive_places, make_host, make_masters
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.envelope import Envelope
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.bridge.timing.bus_model import BusEventKind
 from echelon.bridge.timing.buses import make_buses
@@ -137,7 +137,7 @@ class Commander:
         self.next_ns = bridge.first_ns
         """End of the last period that frames were made for"""
         self.robots = [RobotChannel(robot) for robot in plan.robots]
-        self.buses: list[BusTime | IdealBus] = make_buses(plan)
+        self.buses: list[ArbitratedBus | IdealBus] = make_buses(plan)
         self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
         for robot in self.robots:
             listeners = self._listeners[robot.robot.drive.bus]

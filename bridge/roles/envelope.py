@@ -22,7 +22,7 @@ from echelon.plan.can_plan import EnvelopePlan
 WINDOW_NS = 250_000_000
 
 
-class Violation(StrEnum):
+class Rejection(StrEnum):
     """Why torques became zero."""
 
     CLOCK = "time ran backwards"
@@ -40,7 +40,7 @@ class Verdict(NamedTuple):
 
     tau_right: float
     tau_left: float
-    reason: Violation | None
+    reason: Rejection | None
 
 
 class Envelope:
@@ -51,7 +51,7 @@ class Envelope:
             if not getattr(plan, name) >= 0:
                 raise ValueError(f"{name} must be 0 or more, not {getattr(plan, name)!r}")
         self.plan = plan
-        self.violations: Counter[Violation] = Counter()
+        self.rejections: Counter[Rejection] = Counter()
         self._clock_ns = -math.inf
         self._wheels = _Wheel(plan), _Wheel(plan)
 
@@ -59,11 +59,11 @@ class Envelope:
         """Returns what is to be sent at `now_ns` for torques [N m] that were commanded at `command_ns`."""
         if self._clock_ns == -math.inf:
             self.stop(now_ns)
-        reason = self._violation(now_ns, command_ns, tau_right, tau_left)
+        reason = self._rejection(now_ns, command_ns, tau_right, tau_left)
         if reason is None:
             self._clock_ns = now_ns
             return Verdict(tau_right, tau_left, None)
-        self.violations[reason] += 1
+        self.rejections[reason] += 1
         self.stop(now_ns)
         return Verdict(0.0, 0.0, reason)
 
@@ -73,17 +73,17 @@ class Envelope:
         for wheel in self._wheels:
             wheel.stop(self._clock_ns)
 
-    def _violation(self, now_ns: int, command_ns: int, tau_right: float, tau_left: float) -> Violation | None:
+    def _rejection(self, now_ns: int, command_ns: int, tau_right: float, tau_left: float) -> Rejection | None:
         if now_ns < self._clock_ns:
-            return Violation.CLOCK
+            return Rejection.CLOCK
         if command_ns > now_ns:
-            return Violation.FUTURE
+            return Rejection.FUTURE
         if now_ns - command_ns > self.plan.stale_ns:
-            return Violation.STALE
+            return Rejection.STALE
         if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
-            return Violation.NOT_FINITE
+            return Rejection.NOT_FINITE
         right, left = self._wheels
-        return right.violation(now_ns, tau_right) or left.violation(now_ns, tau_left)
+        return right.rejection(now_ns, tau_right) or left.rejection(now_ns, tau_left)
 
 
 class _Wheel:
@@ -96,20 +96,20 @@ class _Wheel:
         self.sent = 0.0
         self.highs, self.lows = deque([(now_ns, 0.0)]), deque([(now_ns, 0.0)])
 
-    def violation(self, now_ns: int, torque: float) -> Violation | None:
+    def rejection(self, now_ns: int, torque: float) -> Rejection | None:
         """Holds a finite torque against the limits; takes it as sent if it keeps them."""
         plan, sent = self.plan, self.sent
         size, before = abs(torque), abs(sent)
         # what both have in common: the magnitude falls to it, then rises from it
         common = min(size, before) if (torque > 0.0) is (sent > 0.0) else 0.0
         if size > plan.torque_limit:
-            return Violation.TORQUE
+            return Rejection.TORQUE
         if size > common + plan.rise_limit:
-            return Violation.RISE
+            return Rejection.RISE
         if before - plan.fall_limit > common:
-            return Violation.FALL
+            return Rejection.FALL
         if _largest(self.highs, now_ns, torque) + _largest(self.lows, now_ns, -torque) > plan.window_limit:
-            return Violation.WINDOW
+            return Rejection.WINDOW
         self.sent = torque
         return None
 

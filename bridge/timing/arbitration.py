@@ -71,7 +71,7 @@ class _Off:
     runs: int = _RECESSIVE_RUNS
 
 
-class BusTime(BusModel):
+class ArbitratedBus(BusModel):
     """A bus of `bitrate` [bit/s]; see `BusModel`.
 
     `capacity` is how many frames a node holds, the one on the bus included; `note_errors` makes an event of each frame that is

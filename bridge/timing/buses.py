@@ -6,21 +6,21 @@ from echelon.bridge.frame_message import BRIDGE_NODE
 from echelon.bridge.protocols.frame import WHEELS
 from echelon.bridge.protocols.registry import DrivePlace, drive_places
 from echelon.bridge.reports import EVENTS, BusEvent, BusReport, IdentifierReport, ScheduledEvent
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_model import BusModel, Traffic
 from echelon.bridge.timing.ideal_bus import IdealBus
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 
 
-def make_buses(plan: Plan, part: int = 0) -> list[BusTime | IdealBus]:
+def make_buses(plan: Plan, part: int = 0) -> list[ArbitratedBus | IdealBus]:
     """Returns the models of all buses.  Where several processes have models of the same buses, each is a `part` of its own
     and draws errors of its own."""
     can, count = plan.can, len(plan.can.buses)
     if can.timing == "ideal":
         return [IdealBus() for _ in range(count)]
     return [
-        BusTime(bus.bitrate, plan.seed, part * count + number, capacity=can.queue, restart_ns=can.restart_ns)
+        ArbitratedBus(bus.bitrate, plan.seed, part * count + number, capacity=can.queue, restart_ns=can.restart_ns)
         for number, bus in enumerate(can.buses)
     ]
 

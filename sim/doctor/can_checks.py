@@ -12,7 +12,7 @@ from typing import Any, Final
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
 from echelon.plan.plan import Plan
-from echelon.sim.doctor.finding import LIMIT_S, Finding
+from echelon.sim.doctor.check_result import LIMIT_S, CheckResult
 
 SHORT_QUEUE: Final = 100
 NET: Final = Path("/sys/class/net")
@@ -20,20 +20,20 @@ _CAN_TYPE: Final = "280"  # ARPHRD_CAN of linux/if_arp.h
 _TOOLS: Final = f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}:/usr/local/sbin:/usr/sbin:/sbin"
 
 
-def check_vcan(name: str = "vcan0") -> Finding:
+def check_vcan(name: str = "vcan0") -> CheckResult:
     """The virtual interface that runs look for first, or the commands to get it."""
     if interface_is_up(name):
-        return Finding(name, "ok", "is up: frames go there, `candump vcan0` shows them")
+        return CheckResult(name, "ok", "is up: frames go there, `candump vcan0` shows them")
     if (NET / name).exists():
-        return Finding(name, "note", "is there, but down", (f"sudo ip link set {name} up",))
+        return CheckResult(name, "note", "is there, but down", (f"sudo ip link set {name} up",))
     if vcan_module():
         more = "sudo modprobe vcan; " if not Path("/sys/module/vcan").exists() else ""
         made = f"sudo ip link add {name} type vcan; sudo ip link set {name} up txqueuelen 1000"
-        return Finding(name, "note", "not there; the kernel can have it", (more + made,))
+        return CheckResult(name, "note", "not there; the kernel can have it", (more + made,))
     guest = "deploy/vcan.sh COMMAND, which runs it in a guest that has one"
     if not shutil.which("linux.uml", path=_TOOLS):
         guest += " (apt-get install user-mode-linux busybox-static iproute2)"
-    return Finding(name, "note", "not there, and this kernel has no module vcan", ("use udp_multicast, or", guest))
+    return CheckResult(name, "note", "not there, and this kernel has no module vcan", ("use udp_multicast, or", guest))
 
 
 def vcan_module() -> bool:
@@ -53,7 +53,7 @@ def _output(program: str, *arguments: str) -> str | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def check_multicast() -> Finding:
+def check_multicast() -> CheckResult:
     """A frame from one bus to another over multicast, which is where frames go without vcan0."""
     url = resolve_url("udp_multicast:") if interface_is_up("vcan0") else resolve_url("auto")
     advice = ("sudo ip link set lo multicast on; sudo ip route add 224.0.0.0/4 dev lo",)
@@ -65,15 +65,15 @@ def check_multicast() -> Finding:
             took_us = (time.perf_counter() - begun_s) * 1e6
             error = sender.error or receiver.error or "it did not come"
     except OSError as cannot:
-        return Finding("multicast", "note", str(cannot), advice)
+        return CheckResult("multicast", "note", str(cannot), advice)
     if frame is None or (frame.can_id, frame.data) != (0x123, b"doctor"):
-        return Finding("multicast", "note", f"a frame on {url}: {error}", advice)
-    return Finding("multicast", "ok", f"a frame on {url} came, after {took_us:.0f} µs")
+        return CheckResult("multicast", "note", f"a frame on {url}: {error}", advice)
+    return CheckResult("multicast", "ok", f"a frame on {url} came, after {took_us:.0f} µs")
 
 
-def check_interfaces(net: Path = NET) -> list[Finding]:
+def check_interfaces(net: Path = NET) -> list[CheckResult]:
     """CAN interfaces besides vcan0: bit rate, state and queue."""
-    findings = []
+    results = []
     for path in sorted(net.glob("*")):
         try:
             is_can = (path / "type").read_text().strip() == _CAN_TYPE
@@ -81,8 +81,8 @@ def check_interfaces(net: Path = NET) -> list[Finding]:
         except (OSError, ValueError):
             continue
         if is_can:
-            findings.append(_interface(path.name, queue, _link(path.name)))
-    return findings
+            results.append(_interface(path.name, queue, _link(path.name)))
+    return results
 
 
 def _link(name: str) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def _link(name: str) -> dict[str, Any]:
         return {}
 
 
-def _interface(name: str, queue: int, link: dict[str, Any]) -> Finding:
+def _interface(name: str, queue: int, link: dict[str, Any]) -> CheckResult:
     info = link.get("linkinfo", {})
     data = info.get("info_data", {})
     parts, advice = [str(info.get("info_kind", "CAN"))], []
@@ -114,25 +114,29 @@ def _interface(name: str, queue: int, link: dict[str, Any]) -> Finding:
     parts.append(f"queue of {queue} frames")
     if queue < SHORT_QUEUE and not name.startswith("vcan"):  # vcan has no queue: it is never full
         advice.append(f"a burst fills it: sudo ip link set {name} txqueuelen 1000")
-    return Finding(name, "note" if advice else "ok", ", ".join(parts), tuple(advice))
+    return CheckResult(name, "note" if advice else "ok", ", ".join(parts), tuple(advice))
 
 
-def check_tools() -> Finding:
+def check_tools() -> CheckResult:
     """Programs to look at a bus with; nothing here needs them."""
     packages = {"candump": "can-utils", "cansend": "can-utils", "ip": "iproute2", "cantools": "python3-cantools"}
     found = [name for name in packages if shutil.which(name, path=_TOOLS)]
     if len(found) < len(packages):
         wanted = " ".join(sorted({package for name, package in packages.items() if name not in found}))
-        return Finding("CAN tools", "note", f"there: {', '.join(found) or 'none'}", (f"sudo apt-get install {wanted}",))
-    return Finding("CAN tools", "ok", ", ".join(found))
+        return CheckResult(
+            "CAN tools", "note", f"there: {', '.join(found) or 'none'}", (f"sudo apt-get install {wanted}",)
+        )
+    return CheckResult("CAN tools", "ok", ", ".join(found))
 
 
-def check_fit(plan: Plan) -> list[Finding]:
+def check_fit(plan: Plan) -> list[CheckResult]:
     """Whether the plan's frames fit its buses."""
     from echelon.bridge.timing.fit import plan_fit
 
-    findings = []
+    results = []
     for fit in plan_fit(plan):
         first, *rest = fit.lines
-        findings.append(Finding(f"bus {fit.bus}", "ok" if fit.fits else "problem", first, tuple(map(str.strip, rest))))
-    return findings
+        results.append(
+            CheckResult(f"bus {fit.bus}", "ok" if fit.fits else "problem", first, tuple(map(str.strip, rest)))
+        )
+    return results

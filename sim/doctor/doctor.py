@@ -21,7 +21,7 @@ import numpy as np
 from echelon.plan.plan import Plan
 from echelon.runtime.session import Session, loopback_endpoints
 from echelon.sim.doctor.can_checks import check_fit, check_interfaces, check_multicast, check_tools, check_vcan
-from echelon.sim.doctor.finding import LIMIT_S, Finding
+from echelon.sim.doctor.check_result import LIMIT_S, CheckResult
 
 PACKAGES: Final = ("eclipse-zenoh", "python-can", "numpy", "scipy", "cantools", "mcap", "pydantic")
 OLDEST: Final = (3, 11)
@@ -48,10 +48,10 @@ class Measured:
     round_trip_s: float = 0.0
 
 
-def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Finding]:
+def examine(plan: Plan | None = None, folder: Path | None = None) -> list[CheckResult]:
     """Makes all checks, those of a plan too if there is one; `folder` is where recordings would go."""
     measured = Measured()
-    checks: list[tuple[str, Callable[[], Finding]]] = [
+    checks: list[tuple[str, Callable[[], CheckResult]]] = [
         ("Python", check_python),
         ("processors", check_processors),
         ("waking", lambda: check_waking(measured)),
@@ -62,46 +62,46 @@ def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Findin
         ("CAN tools", check_tools),
         ("disk", lambda: check_disk(folder or Path())),
     ]
-    findings = [_limited(what, check) for what, check in checks]
-    findings += check_interfaces()
-    if {finding.what for finding in findings if finding.state != "ok"} >= {"vcan0", "multicast"}:
-        findings.append(Finding("CAN bus", "problem", "neither vcan0 nor multicast: frames reach no other process"))
+    results = [_limited(what, check) for what, check in checks]
+    results += check_interfaces()
+    if {result.what for result in results if result.state != "ok"} >= {"vcan0", "multicast"}:
+        results.append(CheckResult("CAN bus", "problem", "neither vcan0 nor multicast: frames reach no other process"))
     if plan is not None:
         if plan.can.enabled:
-            findings += check_fit(plan)
-        findings.append(_limited("wall clock", lambda: check_wall_clock(plan, measured)))
-    return findings
+            results += check_fit(plan)
+        results.append(_limited("wall clock", lambda: check_wall_clock(plan, measured)))
+    return results
 
 
-def text(findings: list[Finding]) -> str:
-    """Returns findings as lines for a terminal, and a verdict."""
-    width = max(len(finding.what) for finding in findings)
+def text(results: list[CheckResult]) -> str:
+    """Returns results as lines for a terminal, and a verdict."""
+    width = max(len(result.what) for result in results)
     lines = []
-    for finding in findings:
-        lines.append(f"{finding.state:<7}  {finding.what:<{width}}  {finding.text}")
-        lines += [f"{'':<{width + 9}}  → {advice}" for advice in finding.advice]
-    problems = [finding.what for finding in findings if finding.state == "problem"]
+    for result in results:
+        lines.append(f"{result.state:<7}  {result.what:<{width}}  {result.text}")
+        lines += [f"{'':<{width + 9}}  → {advice}" for advice in result.advice]
+    problems = [result.what for result in results if result.state == "problem"]
     lines.append(f"NOT USABLE: {', '.join(problems)}" if problems else "usable")
     return "\n".join(lines)
 
 
-def _limited(what: str, check: Callable[[], Finding]) -> Finding:
+def _limited(what: str, check: Callable[[], CheckResult]) -> CheckResult:
     """Makes a check in a thread of its own, so that none can hang the others."""
-    found: list[Finding] = []
+    found: list[CheckResult] = []
 
     def run() -> None:
         try:
             found.append(check())
         except Exception as error:
-            found.append(Finding(what, "problem", f"{type(error).__name__}: {error}"))
+            found.append(CheckResult(what, "problem", f"{type(error).__name__}: {error}"))
 
     thread = threading.Thread(target=run, name=what, daemon=True)
     thread.start()
     thread.join(LIMIT_S)
-    return found[0] if found else Finding(what, "problem", f"no answer within {LIMIT_S:g} s")
+    return found[0] if found else CheckResult(what, "problem", f"no answer within {LIMIT_S:g} s")
 
 
-def check_python(packages: tuple[str, ...] = PACKAGES) -> Finding:
+def check_python(packages: tuple[str, ...] = PACKAGES) -> CheckResult:
     """Python and the packages that a run is made of."""
     versions, missing = [f"Python {platform.python_version()}"], []
     for package in packages:
@@ -111,20 +111,20 @@ def check_python(packages: tuple[str, ...] = PACKAGES) -> Finding:
             missing.append(package)
     if missing or sys.version_info < OLDEST:
         lacks = f"; not installed: {', '.join(missing)}" if missing else ""
-        return Finding("Python", "problem", ", ".join(versions) + lacks, ("make setup, with Python 3.11 or newer",))
-    return Finding("Python", "ok", ", ".join(versions))
+        return CheckResult("Python", "problem", ", ".join(versions) + lacks, ("make setup, with Python 3.11 or newer",))
+    return CheckResult("Python", "ok", ", ".join(versions))
 
 
-def check_processors() -> Finding:
+def check_processors() -> CheckResult:
     """Processors and what else they do."""
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     said = f"{cores} to run on, load {load:.2f}, Linux {platform.release()}"
     if load > cores:
-        return Finding("processors", "note", said, ("busy: runs on a wall clock will be late",))
-    return Finding("processors", "ok", said)
+        return CheckResult("processors", "note", said, ("busy: runs on a wall clock will be late",))
+    return CheckResult("processors", "ok", said)
 
 
-def check_waking(measured: Measured) -> Finding:
+def check_waking(measured: Measured) -> CheckResult:
     """How late a process is woken that slept for a millisecond."""
     late = []
     for _ in range(SLEEPS):
@@ -134,11 +134,11 @@ def check_waking(measured: Measured) -> Finding:
     measured.jitter_s = float(np.percentile(late, 99))
     said = f"{np.median(late) * 1e6:.0f} µs late after 1 ms of sleep, at most 1 % later than {measured.jitter_s * 1e3:.2g} ms"
     if measured.jitter_s > LATE_S:
-        return Finding("waking", "note", said, ("keep to virtual time, or to periods of 10 ms and more",))
-    return Finding("waking", "ok", said)
+        return CheckResult("waking", "note", said, ("keep to virtual time, or to periods of 10 ms and more",))
+    return CheckResult("waking", "ok", said)
 
 
-def check_zenoh(measured: Measured, rounds: int = 200) -> Finding:
+def check_zenoh(measured: Measured, rounds: int = 200) -> CheckResult:
     """Two sessions over the loopback, and how long a message takes from one to the other and back."""
     back = threading.Event()
     (endpoint,) = loopback_endpoints(1)
@@ -152,44 +152,46 @@ def check_zenoh(measured: Measured, rounds: int = 200) -> Finding:
         ping = one.publisher("doctor/ping")
         other.declare_token("doctor/here")
         if one.watch_tokens("doctor/*").wait(["doctor/here"], LIMIT_S / 2):
-            return Finding("Zenoh", "problem", f"no connection over {endpoint}", ("is lo up? is there a firewall?",))
+            return CheckResult(
+                "Zenoh", "problem", f"no connection over {endpoint}", ("is lo up? is there a firewall?",)
+            )
         times = []
         for _ in range(rounds):
             back.clear()
             begun_s = time.perf_counter()
             ping.put(b"doctor" * 10)
             if not back.wait(LIMIT_S / 4):
-                return Finding("Zenoh", "problem", f"messages are lost over {endpoint}")
+                return CheckResult("Zenoh", "problem", f"messages are lost over {endpoint}")
             times.append(time.perf_counter() - begun_s)
     measured.round_trip_s = float(np.median(times))
-    return Finding("Zenoh", "ok", f"sessions over {endpoint}, {measured.round_trip_s * 1e6:.0f} µs there and back")
+    return CheckResult("Zenoh", "ok", f"sessions over {endpoint}, {measured.round_trip_s * 1e6:.0f} µs there and back")
 
 
-def check_buffers(core: Path = Path("/proc/sys/net/core")) -> Finding:
+def check_buffers(core: Path = Path("/proc/sys/net/core")) -> CheckResult:
     """How large a burst a socket may hold for who is waiting for a processor."""
     try:
         most, usual = (int((core / name).read_text()) for name in ("rmem_max", "rmem_default"))
     except (OSError, ValueError) as error:
-        return Finding("socket buffers", "note", f"not known: {error}")
+        return CheckResult("socket buffers", "note", f"not known: {error}")
     said = f"receive at most {most >> 10} KiB, candump has {usual >> 10} KiB unless it asks (-r)"
     if most < BUFFER:
         advice = (
             f"against lost frames in bursts: sudo sysctl -w net.core.rmem_max={BUFFER} net.core.rmem_default={BUFFER}"
         )
-        return Finding("socket buffers", "note", said, (advice,))
-    return Finding("socket buffers", "ok", said)
+        return CheckResult("socket buffers", "note", said, (advice,))
+    return CheckResult("socket buffers", "ok", said)
 
 
-def check_disk(folder: Path) -> Finding:
+def check_disk(folder: Path) -> CheckResult:
     """Room for recordings."""
     free = shutil.disk_usage(folder).free
     said = f"{free / 1e9:.3g} GB free in {folder.resolve()}"
     if free < SPACE:
-        return Finding("disk", "note", said, ("record elsewhere with --out, or make room",))
-    return Finding("disk", "ok", said)
+        return CheckResult("disk", "note", said, ("record elsewhere with --out, or make room",))
+    return CheckResult("disk", "ok", said)
 
 
-def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Finding:
+def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> CheckResult:
     """Whether the plan's shortest period can be kept here in real time, by the work of a few instants in this process."""
     from echelon.sim.engines.in_process import Engine
 
@@ -211,4 +213,4 @@ def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Find
         advice.append(
             f"woken up to {measured.jitter_s * 1e3:.2g} ms late: periods over {2e3 * measured.jitter_s:.2g} ms"
         )
-    return Finding("wall clock", "note" if advice else "ok", said, tuple(advice))
+    return CheckResult("wall clock", "note" if advice else "ok", said, tuple(advice))

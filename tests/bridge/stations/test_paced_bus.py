@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.stations.paced_bus import PacedBus
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.bus_model import BusEventKind
 from echelon.bridge.timing.ideal_bus import IdealBus
@@ -32,7 +32,7 @@ class Port:
 
 
 def paced(**options: Any) -> PacedBus:
-    return PacedBus(Port(), BusTime(500_000, **options), OLD)  # type: ignore[arg-type]
+    return PacedBus(Port(), ArbitratedBus(500_000, **options), OLD)  # type: ignore[arg-type]
 
 
 def bits(frame: Frame) -> int:
@@ -87,7 +87,7 @@ def test_together_they_send_no_more_than_the_bit_rate_allows(
 
 
 def test_alone_it_is_the_model_that_it_has() -> None:
-    one, model = paced(), BusTime(500_000)
+    one, model = paced(), ArbitratedBus(500_000)
     script = [(7_000 * at, 0, Frame(0x100 + at * 37 % 11, bytes(at % 9))) for at in range(50)]
     out = play(script, [one], 0)
     for at, node, frame in script:
@@ -204,7 +204,7 @@ def test_good_frames_of_others_take_errors_back() -> None:
 
 
 def test_what_the_bus_did_not_take_was_not_sent() -> None:
-    one = PacedBus(Port(takes=False), BusTime(500_000), OLD)  # type: ignore[arg-type]
+    one = PacedBus(Port(takes=False), ArbitratedBus(500_000), OLD)  # type: ignore[arg-type]
     one.send(0, 0, Frame(0x100))
     assert one.run(LONGEST) == []
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.random import Philox
 
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.bus_model import BusEvent, BusEventKind, BusModel, Delivered
 from echelon.bridge.timing.ideal_bus import IdealBus
@@ -191,7 +191,7 @@ Script = list[tuple[int, tuple[int, Frame] | int | float | None]]  # gap; send, 
 
 def compare(script: Script, capacity: int, restart_bits: int, rest_bits: int) -> SlowBus:
     """Plays a script on both buses; everything must agree."""
-    fast = BusTime(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT, note_errors=True)
+    fast = ArbitratedBus(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT, note_errors=True)
     slow = SlowBus(7, 2, capacity, restart_bits)
     delivered: list[Delivered] = fast.run(0)
     for gap, action in [*script, (rest_bits, None)]:
@@ -280,7 +280,7 @@ def bits(frame: Frame) -> int:
 
 
 def test_by_hand() -> None:
-    bus = BusTime(500_000)
+    bus = ArbitratedBus(500_000)
     assert (bus.due_ns, bus.busy_ns, bus.load) == (None, 0, 0.0)
     bus.run(-5_000)
     assert bus.load == 0.0
@@ -308,14 +308,14 @@ def test_by_hand() -> None:
 
 
 def test_data_comes_before_remote() -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     bus.send(0, 1, Frame(5, remote=True))
     bus.send(0, 2, Frame(5, b"x"))
     assert [sent.frame.remote for sent in bus.run(MEGA)] == [False, True]
 
 
 def test_three_bits_between_frames_are_time_enough_to_answer() -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     bus.send(0, 1, A)
     bus.send(0, 1, C)
     (first,) = bus.run(bits(A) * BIT - 3 * BIT)
@@ -324,7 +324,7 @@ def test_three_bits_between_frames_are_time_enough_to_answer() -> None:
 
 
 def test_a_full_queue_loses_and_one_that_empties_takes_again() -> None:
-    bus = BusTime(MEGA, capacity=2)
+    bus = ArbitratedBus(MEGA, capacity=2)
     assert [bus.send(0, 1, A), bus.send(0, 1, B), bus.send(0, 1, C), bus.send(0, 2, C)] == [True, True, False, True]
     end_ns = (bits(A) - 3) * BIT
     assert not bus.send(end_ns - 1, 1, C)
@@ -335,7 +335,7 @@ def test_a_full_queue_loses_and_one_that_empties_takes_again() -> None:
 @given(st.integers(1, 2_000_000), frames())
 def test_a_frame_takes_its_bits_at_any_bit_rate(bitrate: int, sent: tuple[int, Frame]) -> None:
     node, frame = sent
-    bus = BusTime(bitrate)
+    bus = ArbitratedBus(bitrate)
     bus.send(11, node, frame)
     due_ns = bus.due_ns
     assert due_ns is not None
@@ -366,13 +366,13 @@ def play(bus: BusModel, script: list[tuple[int, tuple[int, Frame]]], step: bool)
 
 @given(st.lists(st.tuples(gaps, frames()), max_size=30), st.sampled_from([0.0, 0.5]))
 def test_from_one_due_instant_to_the_next_is_the_same(script: list[tuple[int, tuple[int, Frame]]], rate: float) -> None:
-    once = play(BusTime(MEGA, 1, error_rate=rate), script, step=False)
-    assert play(BusTime(MEGA, 1, error_rate=rate), script, step=True) == once
+    once = play(ArbitratedBus(MEGA, 1, error_rate=rate), script, step=False)
+    assert play(ArbitratedBus(MEGA, 1, error_rate=rate), script, step=True) == once
     assert len(once) == len(script)
 
 
 def test_a_bus_that_is_only_waiting_for_a_node_to_come_back_is_due_by_then() -> None:
-    bus = BusTime(MEGA, restart_ns=5_000)
+    bus = ArbitratedBus(MEGA, restart_ns=5_000)
     bus.run(100)
     bus.bus_off(1)
     bus.bus_off(1)
@@ -389,7 +389,7 @@ def test_a_bus_that_is_only_waiting_for_a_node_to_come_back_is_due_by_then() -> 
 
 def test_errors_are_a_function_of_seed_bus_and_attempt() -> None:
     def errors(seed: int, number: int) -> list[int]:
-        bus = BusTime(MEGA, seed, number, error_rate=0.2, note_errors=True)
+        bus = ArbitratedBus(MEGA, seed, number, error_rate=0.2, note_errors=True)
         for n in range(900):
             bus.send(n * 1_000_000, 1, Frame(n))
         bus.run(10**12)
@@ -410,7 +410,7 @@ def test_errors_are_a_function_of_seed_bus_and_attempt() -> None:
 
 @pytest.mark.parametrize(("errors", "after"), [(1, 0), (126, 125), (127, 126), (128, 119), (135, 119)])
 def test_a_receiver_counts_errors_of_others(errors: int, after: int) -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     for node in range(4):
         bus.send(0, node, Frame(node))
     bus.run(MEGA)
@@ -432,7 +432,7 @@ def test_a_receiver_counts_errors_of_others(errors: int, after: int) -> None:
 def test_an_error_costs_between_17_and_23_bits_besides_what_was_sent() -> None:
     costs = set()
     for seed in range(200):
-        bus = BusTime(MEGA, seed, error_rate=1.0, note_errors=True)
+        bus = ArbitratedBus(MEGA, seed, error_rate=1.0, note_errors=True)
         bus.send(0, 1, A)
         due_ns = bus.due_ns
         assert due_ns == 1
@@ -449,14 +449,14 @@ def test_an_error_costs_between_17_and_23_bits_besides_what_was_sent() -> None:
 
 @given(st.lists(frames(), min_size=1, max_size=30))
 def test_nothing_waits_longer_than_all_that_was_sent_takes(sent: list[tuple[int, Frame]]) -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     for node, frame in sent:
         bus.send(0, node, frame)
     bound = sum(worst_case_bits(len(frame.data)) for _, frame in sent) - 3
     assert max(end_ns for _, end_ns, _, _ in bus.run(10**9)) <= bound * BIT
 
 
-@pytest.mark.parametrize("bus", [BusTime(MEGA), IdealBus()])
+@pytest.mark.parametrize("bus", [ArbitratedBus(MEGA), IdealBus()])
 def test_time_goes_on_and_frames_are_frames(bus: BusModel) -> None:
     bus.run(-10)
     with pytest.raises(ValueError, match="before -10 ns, not -11"):
@@ -474,14 +474,14 @@ def test_time_goes_on_and_frames_are_frames(bus: BusModel) -> None:
 
 def test_what_makes_no_bus() -> None:
     with pytest.raises(ValueError, match="bit rate must be at least 1, not 0"):
-        BusTime(0)
+        ArbitratedBus(0)
     with pytest.raises(ValueError, match="capacity must be at least 1, not 0"):
-        BusTime(MEGA, capacity=0)
+        ArbitratedBus(MEGA, capacity=0)
     with pytest.raises(ValueError, match="restart_ns must be at least 0, not -1"):
-        BusTime(MEGA, restart_ns=-1)
+        ArbitratedBus(MEGA, restart_ns=-1)
     for rate in (-0.1, 1.1, float("nan")):
         with pytest.raises(ValueError, match=r"error rate must be 0 \.\. 1"):
-            BusTime(MEGA, error_rate=rate)
+            ArbitratedBus(MEGA, error_rate=rate)
 
 
 def test_ideal_bus() -> None:

@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.response_time import BITRATES, Stream, advice, fits, load, remedies, response_times
 
@@ -72,7 +72,7 @@ def streams_of(case: Case) -> list[Stream]:
 
 def measured(releases: list[tuple[int, int, Frame]]) -> dict[int, int]:
     """The longest response of each identifier for frames that should be queued and are queued at these bits."""
-    bus = BusTime(MEGA, capacity=10_000)
+    bus = ArbitratedBus(MEGA, capacity=10_000)
     due: dict[tuple[int, int], list[int]] = {}
     for wanted, queued, frame in sorted(releases, key=lambda release: release[1]):
         due.setdefault((frame.can_id, queued * BIT), []).append(wanted * BIT)

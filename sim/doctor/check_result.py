@@ -8,7 +8,7 @@ LIMIT_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """The outcome of one check: `state` is `ok`, `note` (works, but) or `problem`; `advice` is what to do about it."""
 
     what: str

@@ -1,24 +1,25 @@
-"""The referee: a passive listener to all buses of a plan, which sees nothing but frames and holds them against the plan.
+"""The referee: a passive listener to all buses of a plan, which compares the frames with the plan (docs/architecture.md, 5.7).
 
-What protocols ask for, their observers check (bridge.<protocol>.observe).  The referee adds what they share.  Kinds:
+The observer of a protocol (bridge.protocols.<protocol>.observe) checks what its protocol demands.  The referee checks what all
+protocols have in common:
 
-    time          a frame is older than the one before it on its bus
-    gap           a cyclic frame came more than half a period after it was due (or more than `tolerance_ns`)
-    silent        it did not come at all for a watchdog and a period, or at the end
-    missing       nothing at all came of an identifier, or of a robot
-    burst         a cyclic frame came more than half a period before it was due, and nothing was owed
-    torque above limit, rise above limit, fall above limit, window above limit
-                  commanded or reported, beyond the envelope by more than a bit; a command may be zero at any time
-    torque not commanded
-                  reported, but beyond all commands of the time in which they can have had an effect
-    torque before the run
-                  commanded or reported while drives are brought up, at negative times
+kind of finding                     meaning
+time                                a frame is older than the one before it on its bus
+gap                                 a cyclic frame began more than half a period (or `tolerance_ns`) after it was due
+silent                              a cyclic frame did not come for a watchdog and a period, or up to the end
+missing                             no frame came with a cyclic identifier, or from a robot
+burst                               a cyclic frame came more than half a period early, without a reason
+torque above limit                  a reported torque exceeds the envelope by more than a bit; observers check commands
+rise, fall or window above limit    a change of the commanded torque exceeds the envelope by more than a bit; a command may
+                                    go to zero at any time
+torque not commanded                a reported torque is outside all commands that may still have an effect
+torque before the run               a torque was commanded or reported before run time 0
 
-`bridge.referee.deadlines` says when frames are due.  A frame that waits for the bus is not late, and no frame is late while
-drives are brought up.  For the same reason feedback may be as old as the stretch of frames that it came in.
+`bridge.referee.deadlines` says when frames are due.  A frame that waits for the bus is not late, and no frame is late before
+run time 0.  Feedback may have waited for the bus, too: it may be as old as the busy stretch that it came in.
 
-Identifiers that no robot of the plan uses are foreign traffic, which is legal: counted, not judged.  Where the torque path
-is not closed there are torques alone, one per acceleration period, and nobody answers.
+Frames with identifiers that no robot of the plan uses are counted but not judged.  On the mirrored path there are only torque
+commands, one per acceleration period.
 """
 
 from collections import Counter
@@ -37,19 +38,19 @@ from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 
 KEPT: Final = 100
-"""Findings that a report holds in full"""
+"""How many findings a report holds in full"""
 WAIT_NS: Final = 1_000_000_000
-"""Feedback is taken to have waited for the bus no longer than this"""
+"""The longest time that feedback is assumed to wait for the bus"""
 SCAN_NS: Final = 50_000_000
-"""How often it is looked for identifiers that are silent"""
+"""The interval of the search for silent identifiers"""
 
 
 class Referee:
-    """Listens to the buses of a plan.  Times are run times [ns]; times below zero are the bringing up of drives.
+    """Listens to the buses of a plan.  Times are run times [ns], negative while drives are brought up.
 
-    `tolerance_ns` is how late a cyclic frame may be, half its period unless given, and how early if that is more; live,
-    where processes wait for their turn, give more.  Raises ValueError for a negative one.  `late`: drives may have been
-    enabled before anybody listened.
+    `tolerance_ns` is how late a cyclic frame may be; None means half its period.  A frame may be early by the larger of both.
+    A referee that listens live needs more tolerance, since processes wait for a processor.  `late` says that the drives may
+    have been enabled before the referee began to listen.  Raises ValueError for a negative tolerance.
     """
 
     def __init__(self, plan: Plan, *, tolerance_ns: int | None = None, late: bool = False) -> None:
@@ -58,8 +59,9 @@ class Referee:
         self.plan = plan
         self.frames = 0
         self.unknown = 0
-        """Frames with identifiers that no robot of the plan uses"""
+        """Number of frames with identifiers that no robot of the plan uses"""
         self.kinds: Counter[str] = Counter()
+        """Number of findings by kind"""
         self.kept: list[FindingReport] = []
         """The first findings"""
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
@@ -80,11 +82,11 @@ class Referee:
 
     @property
     def observers(self) -> list[Observer]:
-        """The robots' observers, by number."""
+        """The observers of all robots, by the robots' numbers."""
         return [robot.observer for robot in self.robots]
 
     def observe(self, time_ns: int, bus: int, frame: Frame) -> list[Finding]:
-        """Takes a frame of bus number `bus`; returns what is wrong with it, or shows by its time to be missing.
+        """Takes a frame of bus number `bus`; returns the findings: faults of the frame, and identifiers that are silent by now.
 
         Raises ValueError for a bus that the plan does not have."""
         if not 0 <= bus < len(self._buses):
@@ -132,7 +134,7 @@ class Referee:
         return said
 
     def finish(self, time_ns: int) -> list[Finding]:
-        """Ends it; returns which identifiers were silent at `time_ns`, or missing all the time."""
+        """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came."""
         said: list[Finding] = []
         time_ns = max(time_ns, *(traffic.last_ns for traffic in self._buses))
         for traffic in self._buses:
@@ -163,7 +165,7 @@ class Referee:
         return said
 
     def report(self, source: str = "can.log") -> RefereeReport:
-        """Returns what was seen and found; `source` is what it listened to."""
+        """Returns the report; `source` says where the frames came from: `can.log`, or `bus`."""
         names = [bus.name for bus in self.plan.can.buses]
         return RefereeReport(
             frames=self.frames,
@@ -180,7 +182,7 @@ class Referee:
         )
 
     def _scan(self, time_ns: int, bus: int, can_id: int | None = None, ended: bool = False) -> Iterator[Finding]:
-        """Tells which cyclic identifiers are silent, but for the one that has just come."""
+        """Yields a finding for each cyclic identifier that has fallen silent, except `can_id`, which has just come."""
         traffic = self._buses[bus]
         for deadline in traffic.cyclic():
             expected_ns = deadline.expected_ns
@@ -192,7 +194,8 @@ class Referee:
             late_ns = traffic.busy_ns - expected_ns
             if late_ns > tolerance_ns:
                 deadline.silent = True
-                text = f"nothing for {(late_ns + deadline.period_ns) / 1e6:.4g} ms, its period is {deadline.period_ns / 1e6:g} ms"
+                period_ns = deadline.period_ns
+                text = f"nothing for {(late_ns + period_ns) / 1e6:.4g} ms, its period is {period_ns / 1e6:g} ms"
                 yield self._tell(bus, deadline.robot, Finding(time_ns, deadline.can_id, "silent", text))
 
     def _tell(self, bus: int, robot: WheelCheck | None, finding: Finding) -> Finding:
@@ -212,9 +215,10 @@ class Referee:
 
 
 def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> RefereeReport:
-    """Returns the referee's report on a run's can.log.  One that ends before the run should is silence, if it is `whole`.
+    """Returns the referee's report on the can.log of a run.
 
-    Raises OSError if it cannot be read."""
+    `whole` says that the run was not cut off: then cyclic frames that are missing at the end of the log are silence.
+    Raises OSError if the log cannot be read."""
     referee = Referee(plan, tolerance_ns=tolerance_ns)
     last_ns = 0
     for time_ns, bus, frame in read_run_log(path, plan):
@@ -225,7 +229,7 @@ def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole:
 
 
 def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:
-    """Yields run time [ns], number of the bus and frame from a run's can.log; buses that the plan lacks are passed over."""
+    """Yields run time [ns], number of the bus, and frame from a run's can.log; skips buses that the plan does not have."""
     numbers = {bus.name: number for number, bus in enumerate(plan.can.buses)}
     start_ns = plan.can.bring_up_ns if plan.can.closed else 0
     for time_ns, channel, frame in read_log(path):

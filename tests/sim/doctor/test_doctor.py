@@ -12,7 +12,7 @@ import pytest
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import resolve_url
 from echelon.sim.doctor import can_checks, doctor
-from echelon.sim.doctor.check_result import CheckResult
+from echelon.sim.doctor.diagnosis import Diagnosis
 from echelon.sim.doctor.doctor import Measured
 from support.runs import echelon, plan_of
 
@@ -70,17 +70,17 @@ def test_multicast_is_tried() -> None:
 def test_a_check_that_hangs_or_raises_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "LIMIT_S", 0.05)
     for_ever = threading.Event()
-    assert doctor._limited("x", lambda: CheckResult("x", str(for_ever.wait()), "")).text == "no answer within 0.05 s"
+    assert doctor._limited("x", lambda: Diagnosis("x", str(for_ever.wait()), "")).text == "no answer within 0.05 s"
     for_ever.set()
-    result = doctor._limited("y", lambda: CheckResult("y", "ok", str(1 / int("0"))))
+    result = doctor._limited("y", lambda: Diagnosis("y", "ok", str(1 / int("0"))))
     assert (result.what, result.state, result.text) == ("y", "problem", "ZeroDivisionError: division by zero")
 
 
 def test_neither_vcan_nor_multicast_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "check_vcan", lambda: CheckResult("vcan0", "note", "not there"))
-    monkeypatch.setattr(doctor, "check_multicast", lambda: CheckResult("multicast", "note", "not there"))
+    monkeypatch.setattr(doctor, "check_vcan", lambda: Diagnosis("vcan0", "note", "not there"))
+    monkeypatch.setattr(doctor, "check_multicast", lambda: Diagnosis("multicast", "note", "not there"))
     # a session in this process would be in the way of tests that fork
-    monkeypatch.setattr(doctor, "check_zenoh", lambda measured: CheckResult("Zenoh", "ok", "not tried"))
+    monkeypatch.setattr(doctor, "check_zenoh", lambda measured: Diagnosis("Zenoh", "ok", "not tried"))
     results = doctor.examine()
     assert [result.what for result in results if result.state == "problem"] == ["CAN bus"]
     assert doctor.text(results).endswith("NOT USABLE: CAN bus")

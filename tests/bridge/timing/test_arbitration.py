@@ -1,4 +1,4 @@
-"""The bus in time, against a slow bus that is simulated bit by bit, and by hand."""
+"""The model of a bus, compared with a slow simulation bit by bit, and with results computed by hand."""
 
 import hashlib
 from collections import Counter, deque
@@ -21,7 +21,7 @@ BIT = 1_000  # ns at 1 Mbit/s
 
 
 def on_wire(frame: Frame) -> str:
-    """A frame as levels, from start to end of frame: CRC by long division, stuffing by looking back."""
+    """Returns a frame as levels from start to end: CRC by long division, stuffing by looking back five bits."""
     bits = f"0{frame.can_id:011b}{frame.remote:b}00{len(frame.data):04b}" + "".join(f"{n:08b}" for n in frame.data)
     remainder = int(bits, 2) << 15
     while remainder.bit_length() > 15:
@@ -56,7 +56,7 @@ class SlowNode:
 
 
 class SlowBus:
-    """One bit after the other: nodes that see the bus free start together, and withdraw where their 1 is a 0."""
+    """A bus simulated bit by bit: nodes that see it free start together, and a node stops where its 1 is overwritten by a 0."""
 
     def __init__(self, seed: int, number: int, capacity: int, restart_bits: int) -> None:
         self.key = key(seed, number)
@@ -128,7 +128,7 @@ class SlowBus:
         self.busy += len(levels) + 3
 
     def step(self) -> None:
-        """One bit."""
+        """Simulates one bit."""
         if not self.levels:
             self.start()
         level = self.levels.popleft() if self.levels else 1
@@ -190,7 +190,7 @@ Script = list[tuple[int, tuple[int, Frame] | int | float | None]]  # gap; send, 
 
 
 def compare(script: Script, capacity: int, restart_bits: int, rest_bits: int) -> SlowBus:
-    """Plays a script on both buses; everything must agree."""
+    """Runs a script on both buses; all results must agree."""
     fast = ArbitratedBus(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT, note_errors=True)
     slow = SlowBus(7, 2, capacity, restart_bits)
     delivered: list[Delivered] = fast.run(0)
@@ -287,7 +287,7 @@ def test_by_hand() -> None:
     assert bus.send(-5_000, 3, C)
     assert bus.due_ns == -5_000 + (bits(C) - 3) * 2_000
     assert bus.send(-5_000, 1, B)  # at the same instant, and more important
-    assert bus.send(-4_999, 2, A)  # too late: B is on its way
+    assert bus.send(-4_999, 2, A)  # too late: B has started
     ends = [
         -5_000 + 2_000 * (bits(B) - 3),
         -5_000 + 2_000 * (bits(B) + bits(A) - 3),
@@ -352,7 +352,7 @@ def run_to(bus: BusModel, due_ns: int) -> list[Delivered]:
 
 
 def play(bus: BusModel, script: list[tuple[int, tuple[int, Frame]]], step: bool) -> list[Delivered]:
-    """Sends and runs: in one go from send to send, or from one `due_ns` to the next."""
+    """Sends the frames of a script; runs the bus from send to send, or, with `step`, from one `due_ns` to the next."""
     delivered, now = [], 0
     for gap, (node, frame) in script:
         now += gap * BIT + gap % 7

@@ -1,4 +1,4 @@
-"""What the doctor finds: the real things here, and files as other machines have them."""
+"""The doctor's checks: on this machine, and with files as they are on other machines."""
 
 import json
 import re
@@ -79,7 +79,7 @@ def test_a_check_that_hangs_or_raises_is_a_problem(monkeypatch: pytest.MonkeyPat
 def test_neither_vcan_nor_multicast_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "check_vcan", lambda: Diagnosis("vcan0", "note", "not there"))
     monkeypatch.setattr(doctor, "check_multicast", lambda: Diagnosis("multicast", "note", "not there"))
-    # a session in this process would be in the way of tests that fork
+    # a session in this process would disturb other tests, which fork
     monkeypatch.setattr(doctor, "check_zenoh", lambda measured: Diagnosis("Zenoh", "ok", "not tried"))
     results = doctor.examine()
     assert [result.what for result in results if result.state == "problem"] == ["CAN bus"]
@@ -128,7 +128,7 @@ def test_which_interfaces_are_can(tmp_path: Path) -> None:
 
 
 def can(state: str, up: bool = True, bitrate: int | None = 500_000) -> dict[str, Any]:
-    """As `ip -details -json link show` has it, in part."""
+    """Returns a part of the output of `ip -details -json link show`."""
     data: dict[str, Any] = {"state": state, "restart_ms": 0}
     if bitrate:
         data["bittiming"] = {"bitrate": bitrate, "sample_point": "0.875", "tq": 125}

@@ -64,9 +64,8 @@ class ChunkedFile:
         self.failure: str | None = None
         self._path = path
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-        with suppress(
-            OSError
-        ):  # the lock tells other processes that the file is being written, until this process ends
+        # the lock tells other processes that the file is being written, until this process ends
+        with suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._position = 0
         self._tail = b""

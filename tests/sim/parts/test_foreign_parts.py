@@ -1,5 +1,5 @@
-"""Users' parts that fail.  They are found before a run if possible.  In a run of any kind the failure is one line, the recording
-is kept, and the wheels are at zero."""
+"""Users' parts that fail.  They are found before a run if possible.  In a run of any kind the failure is one line, the
+recording is kept, and the wheels are at zero."""
 
 import json
 import re

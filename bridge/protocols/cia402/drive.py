@@ -2,9 +2,9 @@
 
 state                     entered when                                        what the drive does
 NOT READY TO SWITCH ON    at power-on or NMT reset                            boots, then SWITCH ON DISABLED
-SWITCH ON DISABLED        after boot-up; disable voltage; quick stop from     no power
-                          a lower state; a fault reset; the NMT state
-                          OPERATIONAL is left
+SWITCH ON DISABLED        after boot-up; disable voltage (00); quick stop     no power
+                          from a lower state; a fault reset; OPERATION
+                          ENABLED when NMT OPERATIONAL is left
 READY TO SWITCH ON        shutdown (controlword 06)                           no power
 SWITCHED ON               switch on (07)                                      no power
 OPERATION ENABLED         enable operation (0F)                               follows the target torque, which starts at zero

@@ -1,4 +1,4 @@
-"""These tests need a vcan0 that is up; where there is none, tests/test_vcan.py runs them in a guest that has one."""
+"""Tests that need a vcan0 that is up.  Without one, tests/test_vcan.py runs them in a guest that has one."""
 
 import pytest
 

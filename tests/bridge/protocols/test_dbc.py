@@ -1,4 +1,4 @@
-"""The DBC: read back, and used by cantools as a user would."""
+"""The DBC: read back, and used by the command line of cantools."""
 
 import re
 import subprocess

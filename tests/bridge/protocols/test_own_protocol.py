@@ -1,4 +1,4 @@
-"""A drive protocol in a file beside the scenario: the example runs, and one that is wrong is named in one line."""
+"""A user's drive protocol in a file beside the scenario: the example runs, and a wrong one causes one line that names it."""
 
 import json
 import shutil
@@ -40,7 +40,7 @@ def changed(folder: Path, *changes: tuple[str, str]) -> Path:
 
 
 def failing(method: str, line: str, owner: str = "MyHost(CyclicHost)") -> tuple[str, str]:
-    """Returns the change that makes a method of a host or drive do something else from 0.3 s on."""
+    """Returns the change after which a method of a host or drive executes `line` from 0.3 s on."""
     where = f"class {owner}:"
     (found,) = [row for row in TEXT.splitlines() if row.startswith(where)]
     return found, (
@@ -66,7 +66,7 @@ def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Pat
     for row in many["can"]["robots"].values():
         assert (row["protocol"], row["enabled"], row["fault"]) == ("my_drive.py:MyProtocol", True, "")
         assert 0.01 < row["largest"] < 1.5
-    # The run's folder has the protocol, too: it can be looked at without the user's.
+    # the run's folder contains the protocol, so the user's folder is not needed to look at the run
     shown = echelon("can", tmp_path / "inprocess", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "r3" in shown.stdout

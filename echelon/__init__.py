@@ -13,7 +13,8 @@ For notebooks and scripts:
     echelon.open_run("runs/demo")           a run from its folder
     echelon.Simulation("lab")               a run step by step
 
-For parts of your own: `Plant`, `Trajectory`, `DriveProtocol` (docs/add-a-law.md, docs/add-a-protocol.md).
+To write parts of your own, derive from `Law`, `Plant`, `Trajectory` or `DriveProtocol` (docs/add-a-law.md,
+docs/add-a-protocol.md).
 The command line is `echelon --help`.
 """
 
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from echelon.agents.plant import Plant
     from echelon.bridge.protocols.protocol import DriveProtocol
+    from echelon.controller.laws import Law
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "DriveProtocol",
+    "Law",
     "Loaded",
     "Plant",
     "Run",
@@ -64,6 +67,10 @@ def __getattr__(name: str) -> Any:
             from echelon.agents.plant import Plant
 
             found = {"Plant": Plant}
+        case "Law":
+            from echelon.controller.laws import Law
+
+            found = {"Law": Law}
         case "Trajectory":
             from echelon.controller.trajectory import Trajectory
 

@@ -4,14 +4,13 @@ A key's description is the docstring below it.  Those are read from the source w
 (`use_attribute_docstrings`), but for every table of every run, which makes each start 30 ms longer.
 """
 
-import ast
-import inspect
 import json
 from collections.abc import Iterator
 from typing import Any, Final
 
 from pydantic import BaseModel
 
+from echelon.docstrings import field_docstrings
 from echelon.plugins import Plugin, Registry
 from echelon.scenario.part_fields import BESIDE, KIND, PART
 from echelon.scenario.tables import Scenario
@@ -55,11 +54,11 @@ def scenario_schema(registry: Registry) -> Schema:
     those of `registry`."""
     schema = Scenario.model_json_schema(mode="serialization")
     schema["$defs"] |= {USE: _USE}
-    docs = {model.__name__: _docstrings(model) for model in _tables(Table)}
+    docs = {model.__name__: field_docstrings(model) for model in _tables(Table)}
     docs[USE] = {key: value["description"] for key, value in _USE["properties"].items()}
     for group, name, part in _built_in(registry):
         schema["$defs"][part.__name__] = _part(group, name, part)
-        docs[part.__name__] = {KIND: f"`{name}`"} | _docstrings(part)
+        docs[part.__name__] = {KIND: f"`{name}`"} | field_docstrings(part)
     schema = _plain(_with_parts(schema, registry))
     schema["$defs"]["Law"]["allOf"] = [
         {
@@ -133,18 +132,6 @@ def _tables(table: type[BaseModel]) -> Iterator[type[BaseModel]]:
     for model in table.__subclasses__():
         yield model
         yield from _tables(model)
-
-
-def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Returns the docstrings below the attributes of a class."""
-    (tree,) = ast.parse(inspect.getsource(model)).body
-    assert isinstance(tree, ast.ClassDef)
-    found = {}
-    for statement, below in zip(tree.body, tree.body[1:], strict=False):
-        match statement, below:
-            case ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text))):
-                found[key] = " ".join(text.split())
-    return found
 
 
 def _plain(schema: Any) -> Any:

@@ -135,7 +135,7 @@ def test_candump_and_cantools_show_what_the_drive_says(bench: Bench, client: Cli
     dbc = tmp_path / "native.dbc"
     dbc.write_text(lab_dbc(PLAN.torque_scale))
     with (
-        subprocess.Popen(["candump", "vcan0", "-n", "60", "-T", "10000"], stdout=subprocess.PIPE) as one,
+        subprocess.Popen(["candump", "vcan0", "-n", "150", "-T", "10000"], stdout=subprocess.PIPE) as one,
         subprocess.Popen(
             [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)],
             stdin=one.stdout,
@@ -144,15 +144,15 @@ def test_candump_and_cantools_show_what_the_drive_says(bench: Bench, client: Cli
         ) as two,
     ):
         while one.poll() is None:
-            client.heard()
-            client.command(0.375, -0.125)
+            # A guest that stood still for longer than the watchdog has a drive in fault; it is cleared, then goes on.
+            client.command(0.375, -0.125, clear=FAULT in client.heard().states)
         assert one.stdout is not None
         one.stdout.close()
         shown = two.communicate(timeout=50)[0].splitlines()
-    assert len(shown) == 60
+    assert len(shown) == 150
     assert {found[1] for line in shown if (found := re.search(r":: (\w+)\(", line))} == {
         f"{kind}_g2_r4" for kind in ("torque", "feedback", "status")
     }
     said = [line for line in shown if "mean_tau_right: 0.375 Nm, mean_tau_left: -0.125 Nm" in line]
     assert len(said) > 10
-    assert all("state_right: enabled, state_left: enabled," in line for line in said)
+    assert sum("state_right: enabled, state_left: enabled," in line for line in said) > 10

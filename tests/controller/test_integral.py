@@ -210,6 +210,7 @@ def steady(name: str, *overrides: str) -> dict[str, Array]:
     return {series.block.name: series.error[-1] for series in blocks.series}
 
 
+@pytest.mark.slow
 def test_what_the_controller_does_not_know_vanishes_in_runs():
     """The shipped scenario: a slope, resistance, a load.  The linear law's error of the centroid is that of statics."""
     kept = steady("integral", "law.use=linear", "law.parameters={}")

@@ -278,6 +278,7 @@ def test_laws_of_this_package_cost_no_checks() -> None:
     assert make_nu(plan.law, BLOCK).__module__ == "echelon.controller.laws.linear"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["integral", "sliding"])
 def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
     plan = plan_of(name)
@@ -286,6 +287,7 @@ def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
     assert all(claim.holds for claim in claims), claims
 
 
+@pytest.mark.slow
 def test_what_sliding_claims_takes_the_linear_law_nine_times_as_long() -> None:
     plan = plan_of("lab", "claims=[{block='intra',settled_by=1.0,band=1e-4},{block='inter',settled_by=1.0,band=1e-4}]")
     intra, inter = (claim.measured for claim in claim_results(plan, block_series(trace_of(plan))))

@@ -1,6 +1,7 @@
 """Layouts of messages in random trees: against what roles really say, and against the law of all robots at once."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
@@ -38,6 +39,7 @@ def nodes_below(plan: Plan, index: int) -> list[int]:
     return [*(node for child in plan.formation[index].children for node in nodes_below(plan, child)), index]
 
 
+@pytest.mark.slow
 @SETTINGS
 @given(trees(max_robots=8), st.sampled_from(["mirror", "closed"]), COUPLINGS, st.booleans())
 def test_what_may_be_said_is_what_is_said(tree, path, coupling, avoidance):

@@ -61,6 +61,7 @@ seeds = st.integers(0, 1000)
 TICKS = 25
 
 
+@pytest.mark.slow
 @given(links_strategy, seeds, st.integers(0, 3), st.randoms(use_true_random=False))
 def test_every_interleaving_is_heard_alike(links, seed, silent, shuffle):
     """Messages come in any order, as late as can be or long before their time, some twice."""

@@ -5,7 +5,7 @@ For notebooks and scripts:
     import echelon
 
     run = echelon.run("lab", {"law.lead": 0.0}, engine="inprocess")
-    run.verdict                             what it claimed, and whether that held
+    run.verdict                             whether the run holds, and the reasons if not
     run.blocks["inter"]["norm"]             |e| of a block over time, a numpy array
     run.figure("errors")                    a figure of the report
 
@@ -48,7 +48,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is asked for: most processes and commands need little of this package."""
+    """Imports a public name when it is first used: most processes and commands need only a few of them."""
     found: dict[str, Any] = {}
     match name:
         case "Loaded" | "load" | "open_run" | "run":

@@ -50,17 +50,24 @@ def run(
     clock: Literal["virtual", "wall"] = "virtual",
     out: str | Path | None = None,
     can: str | None = None,
+    replace: bool = False,
     report: bool = False,
     quiet: bool = False,
 ) -> Run:
     """Runs a scenario and returns what it showed; `run("lab", {"law.lead": 0.0}, engine="inprocess")`.
 
     Like `echelon run`, it leaves a folder (`out`, by default `runs/<scenario>-<utc time>`), and says on standard error how it
-    stands, unless `quiet`.  A run that broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.
-    Raises UserError for what cannot be run."""
+    stands, unless `quiet`.  A run that broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  If
+    `out` holds the run of another scenario, `replace` deletes that.  Raises UserError for what cannot be run."""
     loaded = load(scenario, changes)
     options = Launch(
-        engine=engine, clock=clock, out=None if out is None else Path(out), can=can, report=report, quiet=quiet
+        engine=engine,
+        clock=clock,
+        out=None if out is None else Path(out),
+        can=can,
+        report=report,
+        quiet=quiet,
+        replace=replace,
     )
     return launch(loaded.scenario, loaded.plan, options)
 

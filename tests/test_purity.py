@@ -12,7 +12,7 @@ METHODS = {"read_text", "write_text", "read_bytes", "write_bytes", "mkdir", "unl
 GLOBAL = ("np.random.", "os.", "sys.")
 EXCEPTIONS = {
     ("echelon/planning/loading.py", "path.read_text"),  # a scenario is read where its mistakes are explained
-    ("sim/results/rendering.py", "path.write_text"),
+    ("sim/results/rendering.py", "write_text"),
     ("sim/results/rendering.py", "path.read_bytes"),
 }
 

@@ -23,6 +23,9 @@ class RunOptions(ScenarioOptions):
     out: Path | None = field(
         default=None, metadata=option("folder of the run (default: runs/<scenario>-<utc time>)", "DIR")
     )
+    replace: bool = field(
+        default=False, metadata=option("delete the run of another scenario that the folder of --out holds")
+    )
     can: str | None = field(
         default=None,
         metadata=option(
@@ -64,6 +67,7 @@ def run(options: RunOptions) -> int:
                 report=not options.no_report,
                 quiet=options.quiet,
                 stall_timeout_s=options.stall_timeout,
+                replace=options.replace,
             ),
         )
     except OSError as error:

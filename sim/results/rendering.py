@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from echelon.docstrings import field_docstrings
+from echelon.files import write_text
 from echelon.sim.results.records import Summary
 
 
@@ -33,7 +34,7 @@ def json_text(value: Any) -> str:
 
 def write_summary(summary: Summary, path: Path) -> None:
     """Writes summary.json.  Raises OSError."""
-    path.write_text(json_text(summary) + "\n", encoding="utf-8")
+    write_text(path, json_text(summary) + "\n")
 
 
 def read_summary(path: Path) -> Summary:

@@ -277,6 +277,7 @@ def test_built_in_laws_are_not_checked() -> None:
     assert make_nu(plan.law, BLOCK).__module__ == "echelon.controller.laws.linear"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["integral", "sliding"])
 def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
     plan = plan_of(name)
@@ -285,6 +286,7 @@ def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
     assert all(claim.outcome == "passed" for claim in claims), claims
 
 
+@pytest.mark.slow
 def test_the_linear_law_takes_nine_times_as_long_as_sliding() -> None:
     plan = plan_of("lab", "claims=[{block='intra',settled_by=1.0,band=1e-4},{block='inter',settled_by=1.0,band=1e-4}]")
     intra, inter = (claim.measured for claim in claims_of(trace_of(plan)))

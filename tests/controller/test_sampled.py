@@ -113,6 +113,7 @@ def test_parts_that_do_not_act_on_each_other_change_nothing(tree, seed, T):
         assert spectral_radius(plan, k) == pytest.approx(np.abs(np.linalg.eigvals(histories(plan, k))).max(), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_boundary_is_that_of_the_loop_run_tick_by_tick(seed):
     """Random gains and couplings: around the boundary the run grows or decays as the radius says, and at that rate."""

@@ -1,6 +1,7 @@
 """Layouts of messages in random trees: against the messages that roles send, and against the central law."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
@@ -38,6 +39,7 @@ def nodes_below(plan: Plan, index: int) -> list[int]:
     return [*(node for child in plan.formation[index].children for node in nodes_below(plan, child)), index]
 
 
+@pytest.mark.slow
 @SETTINGS
 @given(trees(max_robots=8), st.sampled_from(["mirror", "closed"]), COUPLINGS, st.booleans())
 def test_roles_send_the_messages_of_the_layout(tree, path, coupling, avoidance):

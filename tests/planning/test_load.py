@@ -538,6 +538,7 @@ TABLES = {name: tomlkit.parse(text).unwrap() for name, text in TEXTS_OF.items()}
 fuzz = settings(max_examples=1500, suppress_health_check=list(HealthCheck))
 
 
+@pytest.mark.slow
 @fuzz
 @given(mutated())
 def test_mutated_scenarios_load_or_are_explained(text):
@@ -558,6 +559,7 @@ def override_keys() -> list[str]:
     return sorted(found | set(more))
 
 
+@pytest.mark.slow
 @fuzz
 @given(
     st.sampled_from(sorted(TEXTS_OF)),

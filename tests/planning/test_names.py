@@ -39,6 +39,7 @@ def plain(text: str) -> str:
     return re.sub(r"(?<=[a-z])-(?=[a-z0-9])", "_", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["inprocess", "processes"])
 def test_a_run_with_hyphens_in_all_names(engine: str, tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(TEXT)

@@ -88,6 +88,7 @@ LINES = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=200, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(SCENARIOS), st.lists(LINES, min_size=1, max_size=5))
 def test_any_effective_scenario_reads_back(path, overrides):

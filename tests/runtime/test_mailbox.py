@@ -61,6 +61,7 @@ seeds = st.integers(0, 1000)
 TICKS = 25
 
 
+@pytest.mark.slow
 @given(links_strategy, seeds, st.integers(0, 3), st.randoms(use_true_random=False))
 def test_a_stage_gets_the_same_messages_in_any_order_of_arrival(links, seed, silent, shuffle):
     """Messages come in any order, as late as possible or long before they are used, some twice."""

@@ -50,6 +50,7 @@ def failing(method: str, line: str, owner: str = "MyHost(CyclicHost)") -> tuple[
     )
 
 
+@pytest.mark.slow
 def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Path) -> None:
     scenario = folder / "my_drive.toml"
     runs = {}
@@ -72,6 +73,7 @@ def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Pat
     assert "r3" in shown.stdout
 
 
+@pytest.mark.slow
 def test_on_a_wall_clock_too(folder: Path, tmp_path: Path) -> None:
     sets = ("--set", "duration=1.0", "--set", "claims=[]", "--set", "can.watchdog=0.5")
     done = echelon("run", folder / "my_drive.toml", "--clock", "wall", *sets, *QUIET, "--out", tmp_path / "run")
@@ -93,6 +95,7 @@ def test_the_dbc_and_the_mirrored_path(folder: Path, tmp_path: Path) -> None:
     assert summary_of(tmp_path / "run")["can"]["referee"]["findings"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["inprocess", "processes"])
 @pytest.mark.parametrize(
     ("change", "says"),
@@ -116,6 +119,7 @@ def test_what_fails_in_a_run_is_one_line_and_wheels_are_stopped_first(
     assert says in verdict["reasons"][0]
 
 
+@pytest.mark.slow
 def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Path) -> None:
     scenario = changed(folder, failing("command", "raise KeyError('w')"))
     sets = ("--set", "claims=[]", "--set", "can.watchdog=0.5")

@@ -83,6 +83,7 @@ def measured(releases: list[tuple[int, int, Frame]]) -> dict[int, int]:
     return worst
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(cases(jitter=True), st.data())
 def test_nothing_measured_exceeds_the_bound(case: Case, data: st.DataObject) -> None:
@@ -98,6 +99,7 @@ def test_nothing_measured_exceeds_the_bound(case: Case, data: st.DataObject) -> 
         assert bound is None or worst[can_id] <= bound
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(cases(jitter=False), st.integers(0, 4))
 def test_the_bound_is_reached(case: Case, at: int) -> None:

@@ -26,6 +26,7 @@ class Launch:
     report: bool = True
     quiet: bool = False
     stall_timeout_s: float = 30.0
+    keep_going: bool = False
 
 
 def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
@@ -50,6 +51,7 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
             can_urls=urls,
             display=display,
             stall_timeout_s=options.stall_timeout_s,
+            keep_going=options.keep_going,
         )
     except OSError as error:
         if error.filename is None:  # of a write to a file that was open

@@ -34,6 +34,9 @@ class RunOptions(ScenarioOptions):
     json: bool = field(default=False, metadata=option("print the summary as JSON"))
     quiet: bool = field(default=False, metadata=option("show no progress"))
     no_report: bool = field(default=False, metadata=option("write no report.html"))
+    keep_going: bool = field(
+        default=False, metadata=option("go on though a robot's state is not finite; otherwise the run stops there")
+    )
     stall_timeout: float = field(
         default=30.0,
         metadata=option("give a run up that stands still for so long, in virtual time", "S", parse=seconds),
@@ -64,6 +67,7 @@ def run(options: RunOptions) -> int:
                 report=not options.no_report,
                 quiet=options.quiet,
                 stall_timeout_s=options.stall_timeout,
+                keep_going=options.keep_going,
             ),
         )
     except OSError as error:

@@ -155,6 +155,7 @@ def list_specs(
     metadata: dict[str, str],
     part_files: dict[str, str],
     recorded: bool,
+    keep_going: bool,
 ) -> list[ProcessSpec]:
     """Lists the processes of a run and who connects to whom.
 
@@ -178,6 +179,7 @@ def list_specs(
         "scenario_toml": scenario_toml,
         "metadata": metadata,
         "part_files": part_files,
+        "keep_going": keep_going,
     }
 
     def with_hubs(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:

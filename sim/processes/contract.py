@@ -43,6 +43,8 @@ class ProcessSpec:
     """One per bus of the plan; none: no bus"""
     scenario_toml: str = ""
     metadata: dict[str, str] = field(default_factory=dict)
+    keep_going: bool = False
+    """The run goes on though a robot's state is not finite"""
     part_files: dict[str, str] = field(default_factory=dict)
     """Texts of the files that parts come from, by their names in the folder"""
 

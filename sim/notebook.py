@@ -58,7 +58,8 @@ def run(
 
     Like `echelon run`, it leaves a folder (`out`, by default `runs/<scenario>-<utc time>`), and says on standard error how it
     stands, unless `quiet`.  It stops where a robot's state is first not finite, unless it is to `keep_going`.  A run that
-    broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  Raises UserError for what cannot be run."""
+    broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  Raises UserError for what cannot be
+    run."""
     loaded = load(scenario, changes)
     options = Launch(
         engine=engine,

@@ -29,7 +29,7 @@ from echelon.plan.plan import Plan
 from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
 from echelon.sim.engines.in_process import Engine
-from echelon.sim.engines.interruption import interruption
+from echelon.sim.interruption import interruption
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
@@ -115,7 +115,9 @@ def execute(
     can = outcome.can
     if can is not None and can.referee is None:
         try:
-            can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not (outcome.failure or outcome.stopped)))
+            can = replace(
+                can, referee=judged(folder / LOG, plan, clock, whole=not (outcome.failure or outcome.stopped))
+            )
         except PartRunError as error:
             outcome.failure = outcome.failure or str(error)
     display.close()

@@ -85,7 +85,7 @@ class RunError(Exception):
     """The run cannot go on; the text says why."""
 
 
-class Diverged(Exception):
+class DivergedError(Exception):
     """There is no point in going on; the text says why."""
 
 
@@ -143,7 +143,7 @@ class Supervisor:
             self.progress.phase = "finishing"
         except RunError as error:
             failure = str(error)
-        except Diverged as error:
+        except DivergedError as error:
             diverged, self.progress.note = True, f"{error}: the run stops"
         except KeyboardInterrupt:
             failure = "interrupted"
@@ -228,7 +228,7 @@ class Supervisor:
                     raise RunError(f"the recording failed: {said.failure}")
                 if said.lost is not None and progress.phase == "running":
                     progress.phase = "stopping"
-                    raise Diverged(said.lost.text(self.plan))
+                    raise DivergedError(said.lost.text(self.plan))
             case Failed():
                 starting = progress.phase == "starting"
                 raise RunError(
@@ -314,7 +314,7 @@ class Supervisor:
         ):
             try:
                 self._serve(0.05)
-            except (RunError, Diverged):
+            except (RunError, DivergedError):
                 pass  # why the run broke off is known already
         for child in members:
             if child.process.is_alive() and child.done is None:
@@ -338,7 +338,9 @@ class Supervisor:
                     or not child.process.is_alive()
                 ):
                     continue
-                whole = not broken and failure is None and self.virtual  # on a wall clock, messages may be lost on the way
+                whole = (
+                    not broken and failure is None and self.virtual
+                )  # on a wall clock, messages may be lost on the way
                 order = Finish(
                     links=tuple(links),
                     robot_messages=sent["robot"] if whole else None,
@@ -353,7 +355,7 @@ class Supervisor:
                         if not failure and time.monotonic() - begun_s > STALL_REPORT_S:
                             self.progress.note = f"waits for {child.name} to finish ({child.state()})"
                             self._show(self.progress)
-                except (RunError, Diverged, OSError) as error:
+                except (RunError, DivergedError, OSError) as error:
                     failure = failure or str(error)
                 if child.done is not None and isinstance(child.done.report, CanReport):
                     sent["bridge"] = child.done.report.messages

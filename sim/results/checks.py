@@ -147,7 +147,9 @@ def _growth(evidence: Evidence) -> Iterator[CheckResult]:
         if ending.level <= ending.floor:
             text = f"no error grows; all are at most {max(one.floor for _, _, one in judged):.3g} m by then"
         else:
-            text = f"no error grows; that of {name} is {growth:.3g} times as large in the last sixth of the run as before"
+            text = (
+                f"no error grows; that of {name} is {growth:.3g} times as large in the last sixth of the run as before"
+            )
             text += f", {ending.level:.3g} m: {ending.spared}" if ending.spared else ""
         yield CheckResult("growth", "passed", text, growth, "", bound, tuple(name for _, name, _ in judged))
     yield from _too_short("growth", evidence)

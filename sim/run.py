@@ -1,7 +1,7 @@
 """One run from scenario to folder: run it in one process or in many, then write what it leaves.
 
-The folder holds `scenario.toml` (effective), the files of parts that others wrote, `run.mcap`, `can.log`, `torque.dbc`,
-`summary.json` and `report.html`.
+The folder holds `scenario.toml` (effective), the files of parts that others wrote, `run.json`, `run.mcap`, `can.log`,
+`torque.dbc`, `summary.json` and `report.html`.
 """
 
 import os
@@ -40,13 +40,14 @@ from echelon.sim.results.records import ProcessResult, RunFacts, Summary
 from echelon.sim.results.rendering import write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+from echelon.sim.run_state import write_state
 from echelon.sim.view.live import Display
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
 CUT: Final = "run.mcap.cut"
 """The recording of a run that was killed, once it has been mended (echelon.sim.recovery)."""
-FILES: Final = ("scenario.toml", "run.mcap", CUT, "can.log", "torque*.dbc", "summary.json", "report.html")
+FILES: Final = ("scenario.toml", "run.json", "run.mcap", CUT, "can.log", "torque*.dbc", "summary.json", "report.html")
 """What a run leaves, at most."""
 
 
@@ -87,6 +88,8 @@ def execute(
     parts = keep_parts(scenario, folder)
     toml = effective_toml(scenario, parts.names)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
+    buses = dict(zip([bus.name for bus in plan.can.buses], can_urls, strict=False))  # without frames there are no URLs
+    write_state(folder, engine, clock, buses)
     metadata = {
         "scenario": scenario.name,
         "engine": engine,

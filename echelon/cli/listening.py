@@ -106,8 +106,8 @@ def _show(table: CanTable, heard: Iterator[Heard], as_json: bool, console: Conso
 
 
 def judge_run(plan: Plan, folder: Path) -> RefereeReport:
-    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Of a run that goes on, what there is
-    by now.  Raises UserError."""
+    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Of a run that goes on, what there
+    is by now.  Raises UserError."""
     tolerance_ns, whole = _told_by(folder, plan)
     try:
         return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=whole)

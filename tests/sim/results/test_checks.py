@@ -19,6 +19,7 @@ from support.runs import plan_of
 from support.synthetic import FIELD, can_report, of_errors, run_facts, with_states
 
 CLAIM = "claims=[{block='intra', settled_by=5.0}]"
+NO_RECORDING = "health.off=['recording']"
 LIMIT = "robot.torque_limit=2.0"
 FINDING = RefereeReport(7, 0, {"gap": 1}, (FindingReport(2.5, "can0", "100", "gap", "late", "g1/r1"),), {})
 CLEAN = RefereeReport(7, 0, {}, (), {})
@@ -144,7 +145,7 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
         "not tested": (lambda: judged(decaying(), links=[]), "nobody counted the messages"),
     },
     "silence": {
-        "passed": (lambda: judged(without(decaying(0.1, "health.off=['recording']"), 3, slice(100, 149))), "g2/r4 said nothing for 0.5 s"),
+        "passed": (lambda: judged(without(decaying(0.1, NO_RECORDING), 3, slice(100, 149))), "g2/r4 said nothing for 0.5 s"),
         "failed": (lambda: judged(without(decaying(), 3, slice(100, 150))), "g2/r4 said nothing for 0.51 s"),
     },
     "refused": {

@@ -1,1 +1,1 @@
-"""The robot: its plant and its torque loop."""
+"""The robot: its plants, its torque loop, its role."""

@@ -1,18 +1,20 @@
-"""Plants: how a robot moves under held wheel torques (label 801; theory.md section 1).
+"""Plants: the motion of a robot under held wheel torques (label 801; docs/architecture.md, 2.1 and 2.2).
 
-State: reference point p = (x, y), heading θ, forward speed v, yaw rate ω; e_v = (cos θ, sin θ), e_n = (-sin θ, cos θ);
+The state is the reference point p = (x, y), the heading θ, the forward speed v and the yaw rate ω.  With e_v = (cos θ, sin θ)
+and e_n = (-sin θ, cos θ),
 
     ṗ = v e_v + d ω e_n
 
 *Paper*: v̇ = (τ_r + τ_l)/(m1 r), ω̇ = R (τ_r - τ_l)/(J r), J = I - m1 d².
-*Rigid body*, its mass at the reference point: v̇ = F/m1 + d ω², ω̇ = (τ - m1 d v ω)/(I_c + m1 d²), with F = (τ_r + τ_l)/r,
-τ = R (τ_r - τ_l)/r, I_c = I - m1 d².
-*Hill*: the rigid body with a load, on a slope, with rolling resistance; of these the controller knows nothing.
+*Rigid body*, with its mass at the reference point: v̇ = F/m1 + d ω², ω̇ = (τ - m1 d v ω)/(I_c + m1 d²), where
+F = (τ_r + τ_l)/r, τ = R (τ_r - τ_l)/r, I_c = I - m1 d².
+*Hill*: the rigid body with a load, on a slope, with rolling resistance.  The controller does not know these.
 
-A step that leaves the numbers raises ValueError or OverflowError, as the functions of `math` do; `LOST` is the state for that.
+If numbers overflow, a step raises ValueError or OverflowError, as the functions of `math` do; the robot then has the state
+`LOST`.
 
-Both steps are pure functions on floats.  They run inside the torque loop, thousands of times a second, which is why
-they are written out and not in arrays.
+Steps are pure functions of floats.  They run in the torque loop, thousands of times per second of run time, so they are written
+with floats and not with arrays.
 """
 
 from abc import ABC, abstractmethod
@@ -27,17 +29,18 @@ from echelon.plugins import Plugin
 from echelon.scenario.values import NonNegative, Point
 
 GRAVITY: Final = 9.81
-"""[m/s²]"""
+"""Acceleration of gravity [m/s²]"""
 _INNER: Final = (1 - sqrt(1 / 5)) / 2
-"""The Gauss-Lobatto rule with four points has its inner ones here and at 1 - here, weights 1/12, 5/12, 5/12, 1/12: exact
-up to degree 5, and two of the points are the ends, where the direction is known anyway."""
+"""Inner points of the Gauss-Lobatto rule with four points on [0, 1]: `_INNER` and 1 - `_INNER`.  Its weights are 1/12, 5/12,
+5/12, 1/12.  It is exact up to degree 5, and its two outer points are the ends, where cos θ and sin θ are needed anyway."""
 
 
 class RobotState(NamedTuple):
-    """Position of the reference point [m], heading [rad], forward speed [m/s], yaw rate [rad/s]; and e_v, which everyone
-    needs.  Made by `state_at`.
+    """Position of the reference point [m], heading [rad], forward speed [m/s], yaw rate [rad/s], and e_v = (cos θ, sin θ).
+    `state_at` makes it.
 
-    A named tuple, for it is made ten thousand times a second, in a tenth of the time of a frozen dataclass.
+    This is a named tuple because it is made ten thousand times per second of run time: it takes a tenth of the time of a
+    frozen dataclass.
     """
 
     x: float
@@ -55,12 +58,14 @@ def state_at(x: float, y: float, theta: float, v: float, omega: float) -> RobotS
 
 
 Step = Callable[[RobotState, float, float, float], RobotState]
-"""(state, τ_right [N m], τ_left [N m], h [s]) → state after h of held torque."""
+"""(state, τ_right [N m], τ_left [N m], h [s]) → state after h under held torques"""
 
 
 def paper_step(robot: RobotPlan) -> Step:
-    """Returns the exact step of the paper's plant: v and ω are linear in time, θ quadratic; the part of ṗ along e_n
-    integrates to d (e_v(t1) - e_v(t0)), and only v e_v needs a quadrature."""
+    """Returns the step of the paper's plant (docs/architecture.md, 2.1).
+
+    v and ω are linear in time, θ is quadratic.  The part of ṗ along e_n integrates to d (e_v(t1) - e_v(t0)) exactly; only
+    v e_v needs a quadrature."""
     per_sum = 1 / (robot.mass * robot.wheel_radius)
     per_difference = robot.arm / ((robot.inertia - robot.mass * robot.offset**2) * robot.wheel_radius)
     d = robot.offset
@@ -82,7 +87,7 @@ def paper_step(robot: RobotPlan) -> Step:
             ends, inner = h / 12, 5 * h / 12
             x += ends * (v * c_0 + v_1 * c_1) + inner * (v_i * cos(a_1) + v_j * cos(a_2))
             y += ends * (v * s_0 + v_1 * s_1) + inner * (v_i * sin(a_1) + v_j * sin(a_2))
-        else:  # a fast turn within one step takes more panels: the quadrature sees half a radian at a time, up to a limit
+        else:  # a fast turn: divide the step into panels of half a radian, at most 16
             panels = min(ceil(2 * turn), 16) if isfinite(turn) else 1
             width = h / panels
             ends, inner = width / 12, 5 * width / 12
@@ -99,16 +104,16 @@ def paper_step(robot: RobotPlan) -> Step:
 
 
 def rigid_body_step(robot: RobotPlan) -> Step:
-    """Returns the rigid body's step."""
+    """Returns the step of the rigid body (docs/architecture.md, 2.2)."""
     return _body_step(robot, 0.0, (0.0, 0.0), 0.0)
 
 
 def _body_step(robot: RobotPlan, load: float, pull: tuple[float, float], resistance: float) -> Step:
-    """Returns the step of a rigid body that carries `load` [kg] at its reference point; `pull` [m/s²] acts there on all mass,
-    `resistance` [N s/m] on the wheels.
+    """Returns the step of a rigid body that carries `load` [kg] at its reference point.  The acceleration `pull` [m/s²] acts on
+    all mass there, `resistance` [N s/m] on the wheels.
 
-    (v, ω) have no closed form under held torque, so the five equations are integrated with the classical Runge-Kutta rule, in
-    as many sub-steps as keep its error near rounding for the turn at hand."""
+    v and ω have no closed form under held torque.  So the five equations are integrated with the classical Runge-Kutta rule.
+    The number of sub-steps grows with the turn in the step, so that the error stays near rounding."""
     m, d, r, arm = robot.mass + load, robot.offset, robot.wheel_radius, robot.arm
     inertia = robot.inertia + load * d**2  # I_c + m d²
     lever = m * d / inertia
@@ -150,17 +155,17 @@ def _body_step(robot: RobotPlan, load: float, pull: tuple[float, float], resista
 
 
 class Plant(Plugin, ABC):
-    """Base of all plants; the fields of a class are its parameters.
+    """Base class of all plants.  The fields of a class are its parameters.
 
-    A step is a pure function.  Where numbers run away it may raise ValueError or OverflowError, as the functions of `math` do:
-    the robot is lost then."""
+    A step is a pure function.  If numbers overflow it may raise ValueError or OverflowError, as the functions of `math` do;
+    the robot then has the state `LOST`."""
 
     @abstractmethod
     def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
-        """Returns the state after h [s] under held wheel torques [N m]; make it with `state_at`."""
+        """Returns the state after h [s] under held wheel torques [N m].  Use `state_at` to make it."""
 
     def step_of(self, robot: RobotPlan) -> Step:
-        """Returns the step of one robot; to be overridden where something can be computed once per robot."""
+        """Returns the step of one robot.  A class may override this to compute values once per robot."""
         return partial(self.step, robot)
 
 
@@ -168,7 +173,7 @@ class Paper(Plant):
     """The paper's equations."""
 
     def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
-        """Returns the state after h of held torque, exactly but for the quadrature of v e_v."""
+        """Returns the state after h [s] under held torques; exact but for the quadrature of v e_v."""
         return paper_step(robot)(state, tau_right, tau_left, h)
 
     def step_of(self, robot: RobotPlan) -> Step:
@@ -199,11 +204,11 @@ class Hill(Plant):
     (Newton and Euler; the load is at the reference point, and each wheel has half of c).  x and y are along the slope."""
 
     rise: Point = (0.0, 0.0)
-    """How steeply the ground rises along x and along y: 0.05 is five metres in a hundred"""
+    """Slope of the ground along x and along y: 0.05 is five metres in a hundred"""
     load: NonNegative = 0.0
-    """[kg]"""
+    """Mass of the load [kg]"""
     resistance: NonNegative = 0.0
-    """c, force against rolling, over the speed [N s/m]"""
+    """c, rolling resistance: force per speed [N s/m]"""
 
     def step(self, robot: RobotPlan, state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
         """Returns the state after h of held torque."""
@@ -216,18 +221,18 @@ class Hill(Plant):
 
 
 PLANTS: Final[dict[str, type[Plugin]]] = {"paper": Paper, "rigid_body": RigidBody, "hill": Hill}
-"""What is built in, by name."""
+"""The built-in plants by name"""
 
 LOST: Final = RobotState(nan, nan, nan, nan, nan, nan, nan)
-"""The state of a robot whose numbers ran away."""
+"""The state of a robot whose numbers overflowed"""
 _HUGE: Final = 1e12
-"""Where a plant that others wrote may fail because its numbers ran away"""
+"""From this magnitude of its inputs on a plant that is not built in may fail: the run has diverged"""
 
 
 def make_step(robot: RobotPlan) -> Step:
-    """Returns the step of the plant that a robot's plan names; one that is not built in has its answers checked.
+    """Returns the step of a robot's plant.  The answers of a plant that is not built in are checked.
 
-    Raises PartRunError if the plant cannot make it."""
+    Raises PartRunError if `step_of` of the plant raises."""
     plant: Plant = robot.model.made
     if robot.model.is_own:
         return plant.step_of(robot)
@@ -240,21 +245,22 @@ def make_step(robot: RobotPlan) -> Step:
 
 
 def _checked(step: Step, who: str) -> Step:
-    """Returns a step that raises PartRunError if, for numbers that a robot can have, it raises or returns anything but a state
-    of finite numbers."""
+    """Returns a step with its answers checked: it raises PartRunError if `step` raises, or returns anything but a state of
+    finite numbers.  In a run that has diverged (inputs from `_HUGE` on) the step may raise ValueError or OverflowError, or
+    return numbers that are not finite."""
 
     def checked(state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
         given = (*state, tau_right, tau_left)
-        lost = not all(abs(number) < _HUGE for number in given)
+        diverged = not all(abs(number) < _HUGE for number in given)
         try:
             after = step(state, tau_right, tau_left, h)
         except Exception as error:
-            if lost and isinstance(error, (ValueError, OverflowError)):
+            if diverged and isinstance(error, (ValueError, OverflowError)):
                 raise
             raise PartRunError(f"{who}: step raised {type(error).__name__}: {error}") from error
         if not isinstance(after, RobotState):
             raise PartRunError(f"{who}: step must return a RobotState (state_at), not {after!r:.60}")
-        if not lost and not all(map(isfinite, after)):
+        if not diverged and not all(map(isfinite, after)):
             raise PartRunError(f"{who}: step is not finite: {after}")
         return after
 

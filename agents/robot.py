@@ -1,8 +1,9 @@
-"""The robot as a role: it says its state, hears one acceleration, and moves under its own torque loop until the next.
+"""The role of a robot: it sends its state, takes an acceleration, and moves under its torque loop until the next one.
 
-The torque loop runs at its own period inside the robot.  What it did in a period travels with the state at its end:
-one message, where a separate one for torque would cost every delivery twice.  Where the torque path is closed, the
-wheels are turned by drives on a bus instead, and wanted torques travel there in messages of their own.
+The torque loop has its own period and runs inside the robot.  The torques of a period are in the STATE message at the end of
+the period: a message of their own would double the number of messages.  On the closed torque path drives turn the wheels;
+the robot sends the wanted torques in TORQUE messages, and moves with the torques that the drives report
+(docs/architecture.md, 5.1 and 5.2).
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from echelon.runtime.turns import Turn
 
 
 class Robot:
-    """One robot of a plan."""
+    """One robot of a plan, where torque is mirrored: it moves with the torques that it computes."""
 
     def __init__(self, plan: Plan, index: int) -> None:
         robot = plan.robots[index]
@@ -45,14 +46,15 @@ class Robot:
         )
 
     def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Returns the state at `time_ns`."""
+        """Returns the STATE message at `time_ns`."""
         x, y, theta, v, omega, c, s = self.state
         across = self._plan.offset * omega
         values = np.array((x, y, v * c - across * s, v * s + across * c, theta, v, omega, *self._did))
         return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
 
     def _move(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Moves to the end of the period that begins at `time_ns`, with the acceleration heard; zero torque if none."""
+        """Moves to the end of the period that begins at `time_ns`, with the commanded acceleration, or with zero torque if
+        there is no command."""
         command = heard[0]
         if command is None:
             ax = ay = 0.0
@@ -60,7 +62,7 @@ class Robot:
             ax, ay = command.values[self._mine].tolist()
         try:
             self._advance(ax, ay, command is not None)
-        except (ValueError, OverflowError):  # the run diverged: angles and speeds beyond what floats can hold
+        except (ValueError, OverflowError):  # the run diverged: angles and speeds overflow
             self.state = LOST
             self._did = (ax, ay, nan, nan, nan, nan, nan, nan, 0.0)
         return ()
@@ -92,10 +94,10 @@ class Robot:
 
 
 class RobotOnBus(Robot):
-    """The same robot with its torque path closed: it says what torques it wants, and moves with those its drives report.
+    """One robot of a plan on the closed torque path: it moves with the torques that its drives report.
 
-    At an instant it first moves through the torque period that ends there, then says its state; when the acceleration
-    has come, it says its torques.
+    At an instant it first moves through the torque period that ends there.  Then it sends its state.  When the command has
+    come, it sends the wanted torques.
     """
 
     def __init__(self, plan: Plan, index: int) -> None:
@@ -129,7 +131,7 @@ class RobotOnBus(Robot):
         return ()
 
     def _sum_up(self) -> None:
-        """Notes what the wheels did in the period that ends."""
+        """Sums up the torques of the period that ends, for the next STATE message."""
         right, left = zip(*self._torques, strict=True)
         n = len(self._torques)
         self._did = (
@@ -146,7 +148,7 @@ class RobotOnBus(Robot):
         self._limited_count = 0
 
     def _want(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Returns the torques for the torque period that begins at `time_ns`, none if no acceleration was heard."""
+        """Returns the TORQUE message for the torque period that begins at `time_ns`; its torques are zero without a command."""
         command, state, robot = heard[0], self.state, self._plan
         right = left = 0.0
         limited = False
@@ -169,5 +171,5 @@ class RobotOnBus(Robot):
 
 
 def make_robot(plan: Plan, index: int) -> Robot:
-    """Returns a robot's role, as the plan's torque path wants it."""
+    """Returns the role of a robot: `RobotOnBus` if the torque path is closed, otherwise `Robot`."""
     return RobotOnBus(plan, index) if plan.can.closed else Robot(plan, index)

@@ -1,11 +1,11 @@
-"""The torque loop inside the robot: from a wanted acceleration to the torques of its wheels (theory.md section 1).
+"""The torque loop inside the robot: from a wanted acceleration to wheel torques (docs/architecture.md, 2.1).
 
-Inverse of the paper's plant (feedback linearisation): for a wanted p̈ = a,
+It is the inverse of the paper's plant (feedback linearisation).  For a wanted p̈ = a,
 
     τ_r + τ_l = m1 r (e_v · a + d ω²)
     τ_r - τ_l = (J r/(d R)) (e_n · a - v ω)
 
-B(θ) is singular only for d = 0, which no plan has.
+The input matrix B(θ) is singular only for d = 0, and no plan has d = 0.
 """
 
 from collections.abc import Callable
@@ -16,15 +16,15 @@ from echelon.agents.plant import RobotState
 from echelon.plan.plan import RobotPlan
 
 Inverse = Callable[[RobotState, float, float, float], tuple[float, float]]
-"""(state, a_x, a_y [m/s²], lead [s]) → (τ_right, τ_left) [N m]."""
+"""(state, a_x, a_y [m/s²], lead [s]) → (τ_right, τ_left) [N m]"""
 
 
 def make_inverse(robot: RobotPlan) -> Inverse:
     """Returns the inverse for a robot.
 
-    Torque is held while the robot turns, so it is computed for the state `lead` from now, as the robot will be if it
-    does what is wanted; with half a torque period for `lead` the first-order error of the hold goes (theory.md
-    section 7).
+    Torque is held while the robot turns.  So the inverse is computed for the state after `lead` [s] under the wanted
+    acceleration.  With half a torque period for `lead` this removes the first-order error of the hold (docs/architecture.md,
+    2.1; numbers in 2.10).
     """
     m, d, r, arm = robot.mass, robot.offset, robot.wheel_radius, robot.arm
     half_sum = m * r / 2
@@ -47,7 +47,7 @@ def make_inverse(robot: RobotPlan) -> Inverse:
 
 @dataclass(slots=True)
 class TorqueLimits:
-    """What the drives of a robot can do; keeps the last torques for the rate limit."""
+    """The limits of a robot's wheel torques, in SI units.  It keeps the last torques for the rate limit."""
 
     torque_limit: float
     torque_rate_limit: float
@@ -58,10 +58,10 @@ class TorqueLimits:
     tau_left: float = 0.0
 
     def apply(self, tau_right: float, tau_left: float, v: float, omega: float, h: float) -> tuple[float, float, bool]:
-        """Returns the torques that the drives give for wanted ones over the next `h` [s], and whether any was limited.
+        """Returns the limited torques for the wanted ones over the next `h` [s], and whether one was limited.
 
-        Order: rate, magnitude, then wheel speed (v ± R ω)/r: beyond its limit a motor gives none in its direction.
-        Torques that are no numbers become zero, and count as limited.
+        The limits act in this order: rate of change, magnitude, wheel speed.  Beyond the limit of its speed (v ± R ω)/r a
+        wheel gets no torque in its direction of motion.  A torque that is NaN becomes zero and counts as limited.
         """
         limit, change, speed = self.torque_limit, self.torque_rate_limit * h, self.wheel_speed_limit * self.wheel_radius
         if not (
@@ -80,6 +80,7 @@ class TorqueLimits:
         return tau_right, tau_left, False
 
     def _one(self, wanted: float, last: float, wheel_speed: float, change: float) -> float:
+        """Returns the limited torque of one wheel; `change` is the largest change from `last` [N m]."""
         if wanted != wanted:
             return 0.0
         tau = min(max(wanted, last - change), last + change)

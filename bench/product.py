@@ -10,6 +10,7 @@ from echelon.bridge.can.bus_url import resolve_url
 from echelon.planning.loading import effective_toml
 from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
+from echelon.sim.out_folder import OutFolder
 from echelon.sim.parts.loading import load
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.run import execute
@@ -62,7 +63,7 @@ def lab_in_process(*, whole: bool) -> float:
             summary, _ = execute(
                 scenario,
                 plan,
-                Path(folder),
+                OutFolder(Path(folder), scenario.name, ()),
                 engine="inprocess",
                 clock="virtual",
                 can_urls=("virtual",),

@@ -1,1 +1,1 @@
-"""The tree node: centroid-based transformation, control laws, trajectories, collision avoidance."""
+"""The formation: tree nodes, centroid-based transformation, control laws, trajectories, collision avoidance, stability."""

@@ -1,16 +1,19 @@
-"""The tree node: leader of a group or coordinator of all, the same role in different places.
+"""The role of a tree node.  Leaders of groups and the coordinator are the same role in different places of the tree.
 
-Upwards it gathers what its children say and tells its parent its centroid.  Downwards it takes the acceleration of its
-centroid from its parent (the root: from the law of the centroid), adds its own shape's, and turns both into one
-acceleration per child: a = Φ_node⁻¹ (ν_shape, a_centroid).  Because Φ_M is built of the nodes, so is its inverse: the
-robots' accelerations are those of the central law (`controller.laws.central.CentralLaw`).
+On the way up, a node gathers the states of its children and sends its parent its centroid.  On the way down, it takes the
+acceleration of its centroid from its parent (the root: from the law of the centroid), computes the accelerations ν_shape of
+its shape variables, and turns both into one acceleration per child: a = Φ_node⁻¹ (ν_shape, a_centroid).  Φ_M is made of the
+matrices of the nodes, and so is its inverse.  So the robots get the same accelerations as from the central law
+(`controller.laws.central.CentralLaw`; docs/architecture.md, 2.3 and 2.4).
 
-Two more things travel with these (`echelon.plan.layout`): error rates of all blocks, where blocks are coupled, and forces of
-avoidance.  A pair of robots belongs to the lowest node that has both below it: that node computes its ∇f from the positions
-its children sent up.  Above that node the pair's two forces cancel in every mean, below it they are handed down.
+The same messages carry the error rates of all blocks, if blocks are coupled, and avoidance forces, if avoidance is on
+(`echelon.plan.layout`).  A pair of robots belongs to the lowest node that has both below it.  This node computes the pair's ∇f
+from the positions that its children send up.  Above this node the two forces of the pair cancel in every mean; below it they
+are sent down (docs/architecture.md, 2.6).
 
-The linear law is linear in what a node knows, but for the forces.  So its matrices are multiplied out once (`NodeLaw`), and
-a period costs one product upwards and one downwards.  Any other law is asked block by block besides (`NodeBlocks`).
+Apart from the forces, the linear law is linear in the values that a node has.  So its matrices are multiplied out once
+(`NodeLaw`), and a period costs one product on the way up and one on the way down.  Other laws are called for each block in
+each period (`NodeBlocks`).
 """
 
 from collections.abc import Sequence
@@ -32,14 +35,14 @@ from echelon.runtime.turns import Turn
 
 @dataclass(frozen=True, slots=True)
 class NodeLaw:
-    """The law of one node as matrices.  With n children, whose positions and velocities (x, y, vx, vy) make up s (4 n),
-    N robots in all and R below the node:
+    """The law of one node as matrices (docs/architecture.md, 2.4).
 
-        (centroid, its velocity, error rates of the own shape) = up @ s
+        (centroid, its velocity, error rates of the node's shape) = up @ s
         accelerations of the children = down @ (s, c, error rates of all blocks) + of_forces @ forces + constant
 
-    where c is the acceleration of the own centroid (2), or for the root (z_cd, ż_cd, z̈_cd) (6).  The rates (2 N) are
-    left out where no block is coupled.
+    Here s, (4 n,), are the positions and velocities (x, y, vx, vy) of the n children; c is the acceleration of the node's
+    centroid, (2,), or for the root (z_cd, ż_cd, z̈_cd), (6,).  The error rates, (2 N,) for N robots in all, are left out if no
+    blocks are coupled.  The forces, (2 R,), act on the R robots below the node.
     """
 
     up: Array
@@ -54,7 +57,7 @@ class NodeLaw:
         blocks = [(plan.block_of(node.index), slice(0, size - 2))]
         if node.parent is None:
             blocks.append((plan.blocks[-1], slice(size - 2, size)))
-        # An error is (e_x, e_y, ė_x, ė_y) for each variable, the centroid last, as Φ_node makes it of s.
+        # Places of (e_x, e_y, ė_x, ė_y) in the errors of all variables, the centroid last: Φ_node applied to s, less desired.
         error = np.arange(4 * count).reshape(count, 2, 2)
         nu_of_error = np.zeros((size, 4 * count))
         nu_of_rates = np.zeros((size, 2 * len(plan.robots)))
@@ -86,7 +89,7 @@ class NodeLaw:
 
 
 class TreeNode:
-    """One node of a plan's tree as a role."""
+    """One node of a plan's tree as a role, with the stages GATHER (up) and STEER (down)."""
 
     def __init__(self, plan: Plan, index: int) -> None:
         node = plan.nodes[index - len(plan.robots)]
@@ -101,13 +104,13 @@ class TreeNode:
         self._pair_forces = _pair_forces(plan, node) if plan.avoidance.enabled else None
         self._no_forces = np.zeros(2 * node.robots)
 
-        # What it gathers, and steers with:
+        # Values that GATHER sets and STEER uses:
         self._s: Array | None = None
-        """Of the children, once all of them have been heard"""
+        """Positions and velocities of the children; None if the state of a child is missing"""
         self._state: Array = NULL
-        """What its own GROUP_STATE says"""
+        """Values of the node's own GROUP_STATE"""
         self._z_cd: Array = NULL
-        """Desired centroid (z_cd, ż_cd, z̈_cd), known to the root"""
+        """Desired centroid (z_cd, ż_cd, z̈_cd); only at the root"""
 
         children = tuple(
             Input(child, Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE) for child in node.children
@@ -119,7 +122,8 @@ class TreeNode:
         )
 
     def _gather(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Takes the children's states; returns the group's state where the parent wants one now."""
+        """Takes the children's states; returns the GROUP_STATE if the parent runs at this instant.  It is a null message if the
+        state of a child is missing."""
         said = [message.values for message in heard if message is not None]
         if len(said) < len(heard):
             self._s = None
@@ -140,7 +144,8 @@ class TreeNode:
         return self._say_up(time_ns, state)
 
     def _steer(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Takes the parent's reference; returns references and commands for the children."""
+        """Takes the parent's reference; returns REFERENCE and COMMAND for the children.  They are null messages if the state of
+        a child or the parent's reference is missing."""
         law, layout, s, state = self._law, self._layout, self._s, self._state
         mine = layout.mine
         if mine is None:
@@ -171,13 +176,13 @@ class TreeNode:
         return self._say_down(time_ns, further, accelerations)
 
     def _say_up(self, time_ns: int, state: Values) -> tuple[Message, ...]:
-        """Returns the message to the parent, at instants at which it wants one."""
+        """Returns the message to the parent; none at instants at which the parent does not run."""
         if self._parent is None or time_ns % self._parent.period_ns:
             return ()
         return (Message(Channel.GROUP_STATE, self.index, time_ns // self._parent.period_ns, time_ns, state),)
 
     def _say_down(self, time_ns: int, reference: Values, command: Values) -> tuple[Message, ...]:
-        """Returns the messages to the children: to the nodes among them, and to the robots."""
+        """Returns the messages to the children: REFERENCE for child nodes, COMMAND for robots."""
         number = time_ns // self._node.period_ns
         messages = []
         if self._layout.reference is not None:
@@ -188,7 +193,7 @@ class TreeNode:
 
 
 def _pair_forces(plan: Plan, node: NodePlan) -> PairForces:
-    """Returns the forces between robots that stand below different children of a node."""
+    """Returns the forces between robots that are below different children of a node."""
     bounds = accumulate(node.weights, initial=0)
     below = [range(first, last) for first, last in pairwise(bounds)]
     return PairForces(*pairs_between(below), node.robots, plan.avoidance)

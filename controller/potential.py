@@ -1,15 +1,16 @@
-"""Collision avoidance (labels potf, pforce, tp; theory.md section 4).
+"""Collision avoidance (labels potf, pforce, tp; docs/architecture.md, 2.6).
 
-For a pair at distance s, with avoidance radius r_a < sensing radius R_s:
+For two robots at distance s, with the avoidance radius r_a smaller than the sensing radius R_s:
 
     V = ( min{0, (s² - R_s²)/(s² - r_a²)} )²        ∇f_i = -Σ_j ∂V_ij/∂p_i
 
-V rises without bound as s falls to r_a and is zero beyond R_s; ∇f_i pushes i away from j.  Written with q = s²:
+V grows without bound as s falls to r_a, and is zero beyond R_s.  ∇f_i pushes robot i away from robot j.  With q = s²:
 
     -∂V/∂p_i = -2 (p_i - p_j) dV/dq,   dV/dq = 2 (q - R_s²)/(q - r_a²) · (R_s² - r_a²)/(q - r_a²)²   for r_a² < q < R_s²
 
-At and inside r_a the formula of the paper is zero again.  That would be peace where there is none: here the pair is
-pushed apart with the cap `force_limit`, which also bounds ∇f outside, where a sampled controller needs a finite slope.
+At and within r_a the paper's formula is zero again, so it would not separate robots that are too close.  Here the pair is
+pushed apart with `force_limit` in this case.  `force_limit` also bounds ∇f outside r_a, because a sampled controller needs a
+finite slope.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ from echelon.plan.plan import Array, AvoidancePlan
 
 
 def potential(distance: Array, plan: AvoidancePlan) -> Array:
-    """Returns V for distances [m] of any shape, as the paper has it (label potf): zero at and inside r_a, too."""
+    """Returns V for an array of distances [m] of any shape, as in the paper (label potf): also zero at and within r_a."""
     q = np.asarray(distance, dtype=float) ** 2
     inside = (q > plan.avoidance_radius**2) & (q < plan.sensing_radius**2)
     ratio = np.zeros_like(q)
@@ -28,19 +29,19 @@ def potential(distance: Array, plan: AvoidancePlan) -> Array:
 
 
 class PairForces:
-    """∇f of given pairs of robots; the pairs of a node are those whose robots stand under different children."""
+    """∇f of given pairs of robots: pair k has the robots `first[k]` and `second[k]` of `robots` robots."""
 
     def __init__(self, first: NDArray[np.intp], second: NDArray[np.intp], robots: int, plan: AvoidancePlan) -> None:
         self._sensing_square = plan.sensing_radius**2
         self._avoidance_square = plan.avoidance_radius**2
         self._limit = plan.force_limit
-        self._apart = np.zeros((len(first), robots))  # positions of robots to differences of pairs
+        self._apart = np.zeros((len(first), robots))  # the matrix from robots' positions to p_i - p_j of each pair
         self._apart[np.arange(len(first)), first] = 1.0
         self._apart[np.arange(len(first)), second] = -1.0
 
     def __call__(self, positions: Array) -> Array | None:
-        """Returns the force ∇f [m/s²] on every robot, (robots, 2), at `positions`, (robots, 2) [m]; None if all are
-        beyond the sensing radius of each other."""
+        """Returns the force ∇f on every robot, (robots, 2) [m/s²], at `positions`, (robots, 2) [m].  Returns None if no pair is
+        within the sensing radius."""
         apart = self._apart @ positions
         q = np.einsum("ij,ij->i", apart, apart)
         if not q.size or np.minimum.reduce(q) >= self._sensing_square:
@@ -56,7 +57,7 @@ class PairForces:
 
 
 def pairs_between(groups: list[range]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Returns the pairs (i < j) of robots that stand in different ones of `groups`, as two index arrays."""
+    """Returns all pairs of robots from two different `groups`, as two index arrays; the first index is of the earlier group."""
     pairs = [(i, j) for at, group in enumerate(groups) for other in groups[at + 1 :] for i in group for j in other]
     array = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     return array[:, 0], array[:, 1]

@@ -1,7 +1,7 @@
-"""Desired trajectories of the centroid, z_cd(t), with their first two derivatives.
+"""Desired trajectories z_cd(t) of the centroid, with their first two derivatives.
 
-A trajectory is a function of time [s] that returns position [m], velocity [m/s] and acceleration [m/s²] as one (3, 2)
-array.  To add one, derive a class from `Trajectory` (echelon.plugins).
+A trajectory is a function of time [s] that returns position [m], velocity [m/s] and acceleration [m/s²] as one array, (3, 2).
+To add one, derive a class from `Trajectory` (echelon.plugins).
 """
 
 from abc import ABC, abstractmethod
@@ -18,7 +18,7 @@ from echelon.scenario.values import Finite, NonNegative, Point, Positive
 
 
 class Trajectory(Plugin, ABC):
-    """Base of all trajectories; the fields of a class are its parameters."""
+    """Base class of all trajectories.  The fields of a class are its parameters."""
 
     @abstractmethod
     def at(self, t: float) -> Array:
@@ -26,7 +26,7 @@ class Trajectory(Plugin, ABC):
 
 
 class Desired(Protocol):
-    """What a node asks of a trajectory."""
+    """The interface of a trajectory that nodes use."""
 
     def at(self, t: float) -> Array:
         """Returns z_cd [m], ż_cd [m/s] and z̈_cd [m/s²] at t [s], (3, 2)."""
@@ -36,9 +36,9 @@ class Line(Trajectory):
     """z_cd = start + velocity t"""
 
     start: Point = (0.0, 0.0)
-    """Where the centroid is to be at time 0 [m]"""
+    """Desired position of the centroid at time 0 [m]"""
     velocity: Point
-    """[m/s]"""
+    """Velocity [m/s]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -50,13 +50,13 @@ class Circle(Trajectory):
     """z_cd = centre + radius (cos φ, sin φ), φ = rate t + phase"""
 
     centre: Point = (0.0, 0.0)
-    """[m]"""
+    """Centre of the circle [m]"""
     radius: Positive
-    """[m]"""
+    """Radius of the circle [m]"""
     rate: Finite
-    """[rad/s]; negative: clockwise"""
+    """Angular speed [rad/s]; negative is clockwise"""
     phase: Finite = 0.0
-    """Where on the circle at time 0, in radians [rad]"""
+    """Angle φ at time 0 [rad]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -68,16 +68,16 @@ class Circle(Trajectory):
 
 
 class Sine(Trajectory):
-    """z_cd = start + (speed t, amplitude sin(rate t)): the paper's, with speed 1, amplitude 30, rate 0.1"""
+    """z_cd = start + (speed t, amplitude sin(rate t)).  The paper has speed 1, amplitude 30 and rate 0.1"""
 
     start: Point = (0.0, 0.0)
-    """Where the centroid is to be at time 0 [m]"""
+    """Desired position of the centroid at time 0 [m]"""
     speed: Finite
-    """Along the x axis [m/s]"""
+    """Speed along the x axis [m/s]"""
     amplitude: Finite
-    """[m]"""
+    """Amplitude along the y axis [m]"""
     rate: Finite
-    """[rad/s]"""
+    """Angular frequency [rad/s]"""
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""
@@ -92,17 +92,17 @@ class Sine(Trajectory):
 
 
 class Waypoints(Trajectory):
-    """Straight from point to point, at rest in each, with least jerk in between: over a leg from q to p,
+    """Straight lines from point to point with minimum jerk, at rest in each point.  From the point q to the next point p,
 
     z_cd = q + (p - q)(10 s³ - 15 s⁴ + 6 s⁵),   s = (t - t_q)/(t_p - t_q) in [0, 1].
 
-    Before the first time and after the last it rests.
+    Before the first and after the last of `times` it rests.
     """
 
     points: Annotated[list[Point], Field(min_length=2)]
-    """Where the centroid is to be, one after the other [m]"""
+    """Desired positions of the centroid, one after the other [m]"""
     times: Annotated[list[NonNegative], Field(min_length=2)]
-    """When to be at each point [s], ascending"""
+    """The time at which it is at each point [s], ascending"""
 
     @model_validator(mode="after")
     def _times(self) -> Self:
@@ -125,17 +125,18 @@ class Waypoints(Trajectory):
 
 
 TRAJECTORIES: Final[dict[str, type[Plugin]]] = {"line": Line, "circle": Circle, "sine": Sine, "waypoints": Waypoints}
-"""What is built in, by name."""
+"""The built-in trajectories by name."""
 
 
 class _Checked:
-    """A trajectory that others wrote, each of its answers checked."""
+    """A trajectory that is not built in; each of its answers is checked."""
 
     def __init__(self, part: Part[Trajectory]) -> None:
         self._part = part
 
     def at(self, t: float) -> Array:
-        """Returns the trajectory's answer.  Raises PartRunError if it raises, or gives anything but six finite numbers."""
+        """Returns the trajectory's answer.  Raises PartRunError if the trajectory raises, or if its answer is not finite or not
+        of the shape (3, 2)."""
         try:
             answer = np.asarray(self._part.made.at(t), dtype=np.float64)
         except Exception as error:
@@ -148,11 +149,11 @@ class _Checked:
 
 
 def make_trajectory(part: Part[Any]) -> Desired:
-    """Returns the trajectory of a plan; one that is not built in has its answers checked."""
+    """Returns the trajectory of a plan.  The answers of a trajectory that is not built in are checked."""
     trajectory: Trajectory = part.made
     return trajectory if part.is_own else _Checked(part)
 
 
 def sample(trajectory: Desired, times: Array) -> Array:
-    """Returns the trajectory at many instants [s], (T, 3, 2)."""
+    """Returns a trajectory at T instants [s], (T, 3, 2)."""
     return np.array([trajectory.at(t) for t in times.tolist()]).reshape(-1, 3, 2)

@@ -1,13 +1,15 @@
-"""Centroid-based transformation (CBT), theory.md section 2: positions to shape variables and centroid, and back.
+"""The centroid-based transformation from positions to shape variables and centroid, and its inverse (docs/architecture.md,
+2.3).
 
-One rule at every node of the tree.  A node with children at x_1..x_n (robots, or centroids of groups) and weights w_k
-(robots under each child) has
+One rule holds at every node of the tree.  A node with children at x_1..x_n (robots, or centroids of groups) and weights w_k
+(the number of robots below each child) has
 
     z_1 = (x_1 - x_2)/√2
     z_k = x_{k+1} - (Σ_{l≤k} w_l x_l)/(Σ_{l≤k} w_l)        k = 2..n-1
     centroid = (Σ w_l x_l)/(Σ w_l)
 
-Stacked over the tree, children before parents, these rows are the paper's Φ_M: Z = Φ_M X (section IV of the paper).
+The rows of all nodes, children before parents, and the row of the root's centroid form the paper's Φ_M: Z = Φ_M X (section IV
+of the paper).
 """
 
 from collections.abc import Sequence
@@ -19,9 +21,9 @@ from echelon.plan.plan import Array, NodePlan, Plan, ShapePlan
 
 
 def node_matrix(weights: Sequence[int]) -> Array:
-    """Returns Φ_node, (n, n): the shape variables' rows, then the centroid's; it acts on each axis alike.
+    """Returns Φ_node, (n, n): the rows of the shape variables, then the row of the centroid.  It acts on x and y alike.
 
-    Raises ValueError if there is no child, or a weight is not positive.
+    Raises ValueError if there are no weights, or if one is not positive.
     """
     count = len(weights)
     if count == 0 or min(weights) <= 0:
@@ -38,7 +40,7 @@ def node_matrix(weights: Sequence[int]) -> Array:
 
 
 def desired_shape(shape: ShapePlan, weights: Sequence[int]) -> Array:
-    """Returns a node's desired shape variables Z_bd, (n-1, 2), from its plan: as given, or those of given positions."""
+    """Returns the desired shape variables Z_bd of a node, (n-1, 2) [m]: those of the plan, or those of the plan's positions."""
     points = np.array(shape.points, dtype=float).reshape(-1, 2)
     if shape.kind == "vectors":
         return points
@@ -46,9 +48,9 @@ def desired_shape(shape: ShapePlan, weights: Sequence[int]) -> Array:
 
 
 class Transformation:
-    """Φ_M of a whole plan, for those who see all robots at once: central law, analysis, reports.
+    """Φ_M of a whole plan, for code that has all robots at once: central law, analysis, reports.
 
-    Rows are in block order, the centroid last; columns are robots by index.
+    Its rows are in the order of the blocks, the centroid last; its columns are the robots in the order of their indices.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -62,7 +64,7 @@ class Transformation:
             rows.append(node_rows[:-1])
             desired.append(desired_shape(node.shape, node.weights))
         self.matrix: Array = np.vstack([*rows, mean[plan.root.index]])
-        """Φ_M, (N, N); the paper's is this one times the 2×2 identity."""
+        """Φ_M, (N, N); the paper's matrix is its Kronecker product with the 2×2 identity."""
         self.inverse: Array = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
         self.desired_shape: Array = np.vstack(desired)
         """Desired shape variables of all nodes, (N-1, 2)."""
@@ -83,5 +85,5 @@ class Transformation:
 
 
 def subtree_robots(plan: Plan, node: NodePlan) -> range:
-    """Returns the indices of the robots below a node: they are contiguous."""
+    """Returns the indices of the robots below a node; they are contiguous."""
     return range(node.first_robot, node.first_robot + node.robots)

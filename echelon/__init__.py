@@ -5,7 +5,7 @@ For notebooks and scripts:
     import echelon
 
     run = echelon.run("lab", {"law.lead": 0.0}, engine="inprocess")
-    run.verdict                             what it claimed, and whether that held
+    run.verdict                             whether the run holds, and the reasons if not
     run.blocks["inter"]["norm"]             |e| of a block over time, a numpy array
     run.figure("errors")                    a figure of the report
 
@@ -13,7 +13,8 @@ For notebooks and scripts:
     echelon.open_run("runs/demo")           a run from its folder
     echelon.Simulation("lab")               a run step by step
 
-For parts of your own: `Plant`, `Trajectory`, `DriveProtocol` (docs/add-a-law.md, docs/add-a-protocol.md).
+To write parts of your own, derive from `Law`, `Plant`, `Trajectory` or `DriveProtocol` (docs/add-a-law.md,
+docs/add-a-protocol.md).
 The command line is `echelon --help`.
 """
 
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from echelon.agents.plant import Plant
     from echelon.bridge.protocols.protocol import DriveProtocol
+    from echelon.controller.laws import Law
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "DriveProtocol",
+    "Law",
     "Loaded",
     "Plant",
     "Run",
@@ -45,7 +48,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is asked for: most processes and commands need little of this package."""
+    """Imports a public name when it is first used: most processes and commands need only a few of them."""
     found: dict[str, Any] = {}
     match name:
         case "Loaded" | "load" | "open_run" | "run":
@@ -64,6 +67,10 @@ def __getattr__(name: str) -> Any:
             from echelon.agents.plant import Plant
 
             found = {"Plant": Plant}
+        case "Law":
+            from echelon.controller.laws import Law
+
+            found = {"Law": Law}
         case "Trajectory":
             from echelon.controller.trajectory import Trajectory
 

@@ -2,7 +2,7 @@
 
 import sys
 
-# `-m` puts the working folder first among the places of modules: a user's numpy.py there would be taken for numpy.
+# `-m` puts the working folder first in sys.path: a user's numpy.py there would be imported in place of numpy.
 if not sys.flags.safe_path:
     del sys.path[0]
 

@@ -1,8 +1,8 @@
-"""Messages between roles: one header, then float64 values whose order the layouts below name.
+"""Messages between roles: a header, then float64 values in the order of the layouts below.
 
-A message says who sent it (the member's index in the plan), how many it sent before on this channel, and the run time
-of its content.  A *null message* has no values: its source had nothing to say yet (it has not heard from everyone it
-needs).  It keeps a lockstep going, and whoever receives it is as if nothing had come.
+The header holds the source (the member's index in the plan), the sequence number (how many messages the source sent before
+on this channel) and the run time of the content.  A *null message* has no values: its source lacks an input, so it has
+nothing to send.  Null messages keep a lockstep going; a receiver acts as if no message had come.
 """
 
 from collections.abc import Sequence
@@ -19,25 +19,27 @@ NULL.flags.writeable = False
 
 
 class Channel(IntEnum):
-    """What a message carries; the name in lower case is the last chunk of its key."""
+    """The kind of a message's content.  Its name in lower case is the last chunk of the message's key."""
 
     STATE = 1
     """Robot to leader: `STATE_FIELDS`."""
     GROUP_STATE = 2
     """Node to its parent: `GROUP_FIELDS`, then the error rates of every block below (where blocks are coupled), then
-    the positions of every robot below (where robots avoid each other); `echelon.plan.layout` says where each stands."""
+    the positions of every robot below (where robots avoid each other).  `echelon.plan.layout` gives their places."""
     REFERENCE = 3
     """Node to its child nodes: an acceleration (x, y) per child, then the error rates of all blocks (where coupled),
     then the avoidance force (x, y) on every robot below (where robots avoid each other)."""
     COMMAND = 4
     """Group leader to its robots: an acceleration (x, y) per child."""
     FRAMES = 5
-    """Bridge and drives to each other and to those who watch: CAN frames with their times (bridge.frame_message)."""
+    """Bridge to drives and drives to bridge, with copies for the recorder: CAN frames with their instants
+    (bridge.frame_message)."""
     TORQUE = 6
-    """Robot to bridge, on the closed torque path: `TORQUE_FIELDS`.  The drives take the speeds of their shafts from it."""
+    """Robot to bridge, on the closed torque path: `TORQUE_FIELDS`.  The virtual drives receive it too, for the speeds of
+    their shafts."""
     WHEELS = 7
-    """Bridge to robots, on the closed torque path: the torques of every robot's right and left wheel [N m], the mean over
-    the torque period that ends at the message's time, as the drives reported them."""
+    """Bridge to robots, on the closed torque path: the torques of the right and the left wheel of every robot [N m], as the
+    drives reported them: the mean over the torque period that ends at the message's time."""
 
 
 STATE_FIELDS: Final = (
@@ -48,23 +50,25 @@ STATE_FIELDS: Final = (
     "tau_right_peak", "tau_left_peak",
     "saturated",
 )  # fmt: skip
-"""A robot's state at the message's time: position [m], velocity [m/s] of the reference point, heading [rad], forward
-speed [m/s], yaw rate [rad/s]; and what it did in the period that ends there: the acceleration it was commanded [m/s²],
-and of each wheel's torque the mean [N m], the mean square [N² m²] and the largest magnitude [N m] over the inner torque
-periods, and how many of those were saturated."""
+"""Values of a STATE message.
+
+At the message's time: position [m] and velocity [m/s] of the reference point, heading [rad], forward speed [m/s], yaw rate
+[rad/s].  Over the period that ends at this time: the commanded acceleration [m/s²]; for the torque of each wheel its mean
+[N m], its mean square [N² m²] and its largest magnitude [N m] over the torque periods; the number of torque periods in
+which a torque was saturated."""
 
 TORQUE_FIELDS: Final = ("tau_right", "tau_left", "commanded", "saturated", "speed_right", "speed_left")
-"""What a robot wants of its wheels: torques [N m], 0 where `commanded` is 0, for then it has nothing to go by; whether
-they were limited; and what its body does with the wheels meanwhile: their speeds [rad/s]."""
+"""Values of a TORQUE message: the wanted wheel torques [N m]; `commanded`, 1 if the robot has an acceleration to follow, else
+0, and then the torques are 0; `saturated`, 1 if the robot's limits cut a torque; the wheel speeds [rad/s]."""
 
 GROUP_FIELDS: Final = ("x", "y", "vx", "vy")
 """A group's centroid [m] and its velocity [m/s]."""
 
 
 class Message(NamedTuple):
-    """One message; `values` is float64, read-only when it was decoded.
+    """One message.  `values` is float64, and read-only if the message was decoded from bytes.
 
-    A named tuple, for one is made for every message of every tick, in a third of the time of a frozen dataclass.
+    This is a named tuple because every tick makes many messages: it takes a third of the time of a frozen dataclass.
     """
 
     channel: Channel
@@ -75,14 +79,14 @@ class Message(NamedTuple):
 
     @property
     def is_null(self) -> bool:
-        """True if the source had nothing to say yet."""
+        """True if the message has no values: its source had nothing to send."""
         return not self.values.size
 
 
 Heard = Message | None
-"""What a role finds in one of its inputs: the message it is to use now, or None if none has come that says anything."""
+"""One input of a stage: the message in use, or None if no message with values is in use."""
 
 
 def field_index(fields: Sequence[str], *names: str) -> list[int]:
-    """Returns where `names` stand in a layout."""
+    """Returns the positions of `names` in a layout."""
     return [fields.index(name) for name in names]

@@ -1,4 +1,4 @@
-"""Parts of a run that others can write: laws, plants, trajectories and drive protocols.
+"""Parts of a run that users can write themselves: laws, plants, trajectories and drive protocols.
 
 A part is a class derived from the base class of its group (Law, Plant, Trajectory, DriveProtocol).  It is a pydantic model:
 its fields are the parameters that a scenario gives, and pydantic checks them.  A scenario names a part in one of three ways:
@@ -7,8 +7,8 @@ its fields are the parameters that a scenario gives, and pydantic checks them.  
     use = "spiral"                    installed: an entry point of the group `echelon.trajectories`
     use = "my_paths.py:Spiral"        a class in a Python file beside the scenario
 
-A file is read once, when the scenario is loaded.  Its text travels with the plan to every process of a run, so all of them run
-the same code, whatever happens to the file meanwhile, and no folder is added to Python's module path.
+A file is read once, when the scenario is loaded.  Its text travels with the plan to every process of a run.  So all processes
+run the same code even if the file changes meanwhile, and no folder is added to Python's module path.
 """
 
 import hashlib
@@ -31,10 +31,10 @@ GROUPS: Final = ("laws", "plants", "trajectories", "protocols")
 
 
 class PartError(ValueError):
-    """A scenario names a part (echelon.plugins) that cannot be had, or gives it wrong parameters.
+    """A scenario names a part that does not exist or cannot be loaded, or gives it wrong parameters.
 
-    `keys` lead from the part's place in the scenario to what is wrong.  `errors` are those of pydantic, if it is a parameter of
-    `model`; otherwise `text` says what is wrong with the value `shown`."""
+    `keys` lead from the part's key in the scenario to the key that is wrong.  If parameters of the class `model` are wrong,
+    `errors` are pydantic's errors; otherwise `text` says what is wrong with the value `shown`."""
 
     def __init__(
         self,
@@ -48,12 +48,12 @@ class PartError(ValueError):
         self.text, self.keys, self.shown, self.errors, self.model = text, keys, shown, errors, model
 
     def at(self, *keys: str, shown: Any = None) -> "PartError":
-        """Returns the same mistake at other keys."""
+        """Returns the same error with other keys and another shown value."""
         return PartError(self.text, keys, shown, self.errors, self.model)
 
 
 class Plugin(BaseModel):
-    """Base of every part: a frozen pydantic model whose fields are its parameters; unknown keys are mistakes."""
+    """Base class of every part: a frozen pydantic model.  Its fields are the parameters; unknown keys are mistakes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -63,7 +63,7 @@ class Source:
     """The Python file that a part comes from."""
 
     name: str
-    """As the scenario names it, relative to the scenario's folder"""
+    """The path as the scenario gives it, relative to the scenario's folder"""
     text: str
 
     @property
@@ -74,22 +74,22 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Part(Generic[T_co]):
-    """A part as a plan holds it: `made` is the object itself, `use` and `parameters` are what the scenario says of it."""
+    """A part as a plan holds it: `made` is the object; `use` and `parameters` are its name and parameters in the scenario."""
 
     use: str
     parameters: Mapping[str, Any]
-    """All of them, defaults included, as TOML can hold them"""
+    """All parameters, defaults included, as values that TOML can hold"""
     source: Source | None
     """None for parts that are built in or installed"""
     made: T_co = field(compare=False)
 
     @property
     def is_own(self) -> bool:
-        """True for parts of this package: their answers need no check."""
+        """True if the part belongs to this package, so that its answers need no check."""
         return type(self.made).__module__.startswith("echelon.")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickles the source and not the object: a process that gets a plan runs the file's text itself."""
+        """Pickles the source in place of the object: the process that unpickles a plan runs the file's text itself."""
         if self.source is None:
             return Part, (self.use, self.parameters, None, self.made)
         return _from_source, (self.use, self.parameters, self.source)
@@ -101,17 +101,19 @@ def _from_source(use: str, parameters: Mapping[str, Any], source: Source) -> Par
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
-    """A kind of parts: its name (one of `GROUPS`), the base class of its parts, and those that are built in, by name."""
+class PartGroup:
+    """A kind of parts: its name (one of `GROUPS`), the base class of its parts, and the built-in parts by name."""
 
     name: str
     base: type[Plugin]
     built_in: Mapping[str, type[Plugin]]
     default: str = ""
-    """Which of those a scenario has that names none; empty: it must name one"""
+    """The built-in part of a scenario that names no part of this group; empty: the scenario must name one"""
 
     def find(self, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
-        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        """Returns the class that `use` names, and its file if it is a class in a file.  Files are relative to `folder`.
+
+        Raises PartError if there is no such class, or if it is not a complete part of this group."""
         if use in self.built_in:
             return self.built_in[use], None
         file, colon, name = use.rpartition(":")
@@ -128,14 +130,14 @@ class Group:
         return self._checked(found, use), None
 
     def make(self, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
-        """Returns a part with its parameters checked.  Raises PartError."""
+        """Returns the part that `use` names, with these parameters.  Raises PartError if the part or a parameter is wrong."""
         found, source = self.find(use, folder)
         try:
             made = found.model_validate(dict(parameters))
         except ValidationError as error:
             errors = error.errors(include_url=False)
             raise PartError("wrong parameters", errors=errors, model=found) from None
-        except Exception as error:  # of a validator that others wrote
+        except Exception as error:  # a part's own validator may raise anything
             raise PartError(f"{use} refuses its parameters: {_said(error)}") from None
         return Part(use, made.model_dump(mode="json", exclude_none=True), source, made)
 
@@ -154,34 +156,34 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Registry:
-    """All groups of parts.  Who assembles runs makes it (`echelon.sim.parts.loading`), and planning uses it."""
+    """All groups of parts.  `echelon.sim.parts.loading` makes it with the built-in parts; planning uses it."""
 
-    groups: Mapping[str, Group]
+    groups: Mapping[str, PartGroup]
 
     def find(self, group: str, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
-        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        """Returns a class of a group and its file, as `PartGroup.find`.  Raises PartError."""
         return self.groups[group].find(use, folder)
 
     def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
-        """Returns a part of a group with its parameters checked.  Raises PartError."""
+        """Returns a part of a group with these parameters, as `PartGroup.make`.  Raises PartError."""
         return self.groups[group].make(use, parameters, folder)
 
     def default(self, group: str) -> Part[Any]:
-        """Returns the part of a group that a scenario has which names none."""
+        """Returns the default part of a group, for a scenario that names none.  Raises PartError if there is no default."""
         return self.make(group, self.groups[group].default, {}, Path())
 
     def allowed(self, group: str) -> str:
-        """Returns what a scenario may write for a part of a group."""
+        """Returns the sentence of an error that says how a scenario may name a part of a group."""
         return allowed(list(self.groups[group].built_in))
 
 
 def allowed(names: list[str]) -> str:
-    """Returns the sentence that says which parts there are."""
+    """Returns the sentence of an error that lists these names, and says that a class in a file is allowed as well."""
     return f"must be one of {', '.join(map(repr, names))}, or 'file.py:Class'"
 
 
 def read_source(name: str, folder: Path) -> Source:
-    """Returns the text of a Python file.  Raises PartError."""
+    """Returns the text of a Python file in `folder`.  Raises PartError if it cannot be read, or is not UTF-8."""
     path = folder / name
     try:
         return Source(name, path.read_bytes().decode())
@@ -192,7 +194,7 @@ def read_source(name: str, folder: Path) -> Source:
 
 
 def _class_in(source: Source, name: str) -> Any:
-    """Returns a class of a file.  Raises PartError."""
+    """Returns the attribute `name` of a file's module.  Raises PartError if the file fails, or has no such attribute."""
     module = _module(source)
     if not hasattr(module, name):
         classes = [
@@ -206,7 +208,9 @@ def _class_in(source: Source, name: str) -> Any:
 
 
 def _module(source: Source) -> ModuleType:
-    """Runs a file's text once per process.  The module's name holds the text's hash: two files of one name do not meet."""
+    """Returns the module of a file; runs the file's text once per process.  Raises PartError if the text fails.
+
+    The module's name holds the text's hash, so files of the same name with different texts are different modules."""
     name = f"echelon_part_{source.sha256[:16]}"
     if name in sys.modules:
         return sys.modules[name]

@@ -1,7 +1,7 @@
-"""What a role is: a plain object with stages, each a function of (time, what it heard) that returns messages.
+"""Roles and their stages.  A role is a plain object; a stage is a function of a time and of inputs that returns messages.
 
-Who calls the stages is none of the role's business: the in-process engine, a lockstep over Zenoh, or a wall clock.
-A stage runs at every multiple of its period; stages of one instant run in the order of their turns (`echelon.runtime.turns`).
+A role does not know what calls its stages: the in-process engine, a lockstep over Zenoh, or a wall clock.  A stage runs at
+every multiple of its period.  Stages of one instant run in the order of their turns (`echelon.runtime.turns`).
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from echelon.runtime.turns import Turn
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """One channel of one source."""
+    """An input of a stage: the messages of one source on one channel."""
 
     source: int
     channel: Channel
@@ -22,21 +22,22 @@ class Input:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One step of a role: at multiples of `period_ns`, `run(time_ns, heard)` with one entry of `heard` per input."""
+    """One step of a role.  At multiples of `period_ns` it is called as `run(time_ns, heard)`; `heard` has one entry for each
+    of `inputs`, in the same order."""
 
     turn: Turn
-    """When it runs within an instant: after all stages whose turn comes earlier, over all roles of a run"""
+    """The stage's place in the order of an instant: it runs after all stages, of any role, that have an earlier turn"""
     period_ns: int
     inputs: tuple[Input, ...]
     run: Callable[[int, Sequence[Heard]], tuple[Message, ...]]
     first_ns: int = 0
-    """When it runs first; before the run where drives have to be brought up"""
+    """Run time of its first call; negative for bridge and drives, which bring the drives up before run time 0"""
     depth: int = 0
-    """How deep in the tree its node stands, for turns that nodes take one depth after the other"""
+    """Depth of its node in the tree, for turns that nodes take depth by depth; otherwise 0"""
 
 
 class Role(Protocol):
-    """A robot, a leader, the coordinator; or the bridge or the drives between robots and their wheels."""
+    """A robot, a leader, the coordinator, the bridge, or the drives."""
 
     @property
     def index(self) -> int:
@@ -44,4 +45,4 @@ class Role(Protocol):
 
     @property
     def stages(self) -> tuple[Stage, ...]:
-        """Its stages, in the order in which they run at one instant."""
+        """The role's stages, in the order in which they run at one instant."""

@@ -1,4 +1,4 @@
-"""What the name of a scenario stands for: a file, the folder of a run, or one of the scenarios that come with the package."""
+"""Names of scenarios on the command line: a file, the folder of a run, or one of the scenarios shipped with the package."""
 
 from pathlib import Path
 from typing import Final
@@ -11,18 +11,21 @@ EFFECTIVE: Final = "scenario.toml"
 
 
 def shipped() -> dict[str, Path]:
-    """Returns the files of all shipped scenarios by name, in alphabetical order."""
+    """Returns the files of all shipped scenarios by name, in alphabetical order of the names."""
     return {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
 
 
 def run_folder(name: str) -> Path | None:
-    """Returns the folder of a run that a name stands for, or None if it stands for something else."""
+    """Returns `name` as the folder of a run, or None if it is not one.
+
+    A folder with the name of a shipped scenario counts only if it holds a `scenario.toml`."""
     path = Path(name)
     return path if path.is_dir() and (name not in shipped() or (path / EFFECTIVE).exists()) else None
 
 
 def scenario_path(name: str) -> Path:
-    """Returns the file that a name stands for; it need not exist if it looks like one.  Raises UsageError."""
+    """Returns the file of the scenario that a name stands for.  A name with a suffix or a slash is taken as a path, even if
+    there is no such file.  Raises UsageError for any other name that is not a shipped scenario."""
     path = Path(name)
     if folder := run_folder(name):
         return folder / EFFECTIVE

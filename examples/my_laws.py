@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from echelon.controller.laws import Law
+from echelon import Law
 
 
 class SlidingMode(Law):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from echelon.controller.trajectory import Trajectory
+from echelon import Trajectory
 
 
 class Eight(Trajectory):

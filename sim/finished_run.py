@@ -29,7 +29,7 @@ from echelon.sim.results.trace import Array, Trace
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from echelon.sim.report.figures import Picture
+    from echelon.sim.report.drawing import Picture
 
 Value = TypeVar("Value")
 Records = NDArray[np.void]
@@ -167,7 +167,7 @@ class Run:
 
     def figure(self, name: str) -> "Picture":
         """Returns a figure of the report: `trajectories`, `blocks`, `errors`, `distance` or `torques`.  Jupyter shows it;
-        `save(path)` writes it as SVG.  Raises KeyError for another name."""
+        `save(path)` writes it as SVG, PDF or PNG.  Raises KeyError for another name."""
         from echelon.sim.report.figures import picture
 
         return picture(name, self.trace, self._blocks)

@@ -1,6 +1,7 @@
 """From a scenario and how it is to be run to a finished run: what the command `echelon run` and `echelon.run` share."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,8 +11,10 @@ from echelon.plan.plan import Plan
 from echelon.scenario.tables import Scenario
 from echelon.sim.bus_urls import bus_urls, check_wall_clock
 from echelon.sim.finished_run import Run
+from echelon.sim.out_folder import REPORT, OutFolder, out_folder, run_files
 from echelon.sim.processes.children import warm_up
-from echelon.sim.run import execute, new_folder
+from echelon.sim.results.can_lines import some
+from echelon.sim.run import execute
 from echelon.sim.view.live import Display
 
 
@@ -27,6 +30,8 @@ class Launch:
     quiet: bool = False
     stall_timeout_s: float = 30.0
     keep_going: bool = False
+    replace: bool = False
+    """Delete the run of another scenario that `out` holds"""
 
 
 def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
@@ -37,10 +42,23 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
         warm_up()
     urls = bus_urls(plan, options.can, options.engine == "inprocess")
     _check(plan, options, urls)
-    folder = _folder(scenario, options.out)
+    with ExitStack() as stack:
+        files = run_files(plan, bool(urls) or plan.can.closed)
+        try:
+            folder = stack.enter_context(out_folder(scenario.name, options.out, files, options.replace))
+        except OSError as error:
+            if options.out is not None:
+                raise UsageError(f"--out {options.out}: {error.strerror}") from None
+            raise UsageError(f"{error.filename}: {error.strerror}; give a folder with --out") from None
+        return _run_in(folder, scenario, plan, options, urls)
+
+
+def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, urls: tuple[str, ...]) -> Run:
     display = Display(plan, quiet=options.quiet)
     if not options.quiet:
-        display.say(_heading(plan, options, folder, urls))
+        display.say(_heading(plan, options, folder.path, urls))
+    if folder.stays:
+        display.say(f"{folder.path}: not of this run, and left as it is: {some(folder.stays)}")
     try:
         summary, trace = execute(
             scenario,
@@ -55,16 +73,16 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
         )
     except OSError as error:
         if error.filename is None:  # of a write to a file that was open
-            error.filename = str(folder)
+            error.filename = str(folder.path)
         raise
     finally:
         display.close()
-    run = Run(trace, summary, folder)
+    run = Run(trace, summary, folder.path)
     if options.report:
         from echelon.sim.run_folder import report_on  # matplotlib, when it is needed
 
         try:
-            report_on([folder], folder / "report.html")
+            report_on([folder.path], folder.path / REPORT)
         except (UserError, OSError) as error:  # of a run that broke off there may be nothing to report
             run.report_failure = f"no report: {error}"
     return run
@@ -82,16 +100,6 @@ def _check(plan: Plan, options: Launch, urls: Sequence[str]) -> None:
         raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
     if options.clock == "virtual" and not plan.can.virtual_drives:
         raise UsageError("can.virtual_drives = false: real drives need --clock wall")
-
-
-def _folder(scenario: Scenario, out: Path | None) -> Path:
-    """Returns the folder of the run, made.  Raises UsageError."""
-    try:
-        return new_folder(scenario, out)
-    except OSError as error:
-        if out is not None:
-            raise UsageError(f"--out {out}: {error.strerror}") from None
-        raise UsageError(f"{error.filename}: {error.strerror}; give a folder with --out") from None
 
 
 def _heading(plan: Plan, options: Launch, folder: Path, urls: Sequence[str]) -> str:

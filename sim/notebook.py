@@ -50,6 +50,7 @@ def run(
     clock: Literal["virtual", "wall"] = "virtual",
     out: str | Path | None = None,
     can: str | None = None,
+    replace: bool = False,
     report: bool = False,
     quiet: bool = False,
     keep_going: bool = False,
@@ -58,8 +59,8 @@ def run(
 
     Like `echelon run`, it leaves a folder (`out`, by default `runs/<scenario>-<utc time>`), and says on standard error how it
     stands, unless `quiet`.  It stops where a robot's state is first not finite, unless it is to `keep_going`.  A run that
-    broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  Raises UserError for what cannot be
-    run."""
+    broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  If `out` holds the run of another
+    scenario, `replace` deletes that.  Raises UserError for what cannot be run."""
     loaded = load(scenario, changes)
     options = Launch(
         engine=engine,
@@ -69,6 +70,7 @@ def run(
         report=report,
         quiet=quiet,
         keep_going=keep_going,
+        replace=replace,
     )
     return launch(loaded.scenario, loaded.plan, options)
 

@@ -3,7 +3,6 @@
 What nobody wrote down is absent: wall time, counts of links, what became of frames besides those in can.log.
 """
 
-import fcntl
 import os
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,8 +15,10 @@ from echelon.bridge.timing.bus_load import BitCount
 from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
 from echelon.errors import UserError
+from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
+from echelon.sim.out_folder import CUT, RECORDING, REPORT, SUMMARY
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import (
     RecoverResult,
@@ -32,7 +33,7 @@ from echelon.sim.results.records import RunFacts
 from echelon.sim.results.rendering import read_summary, write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
-from echelon.sim.run import CUT, judged
+from echelon.sim.run import judged
 from echelon.sim.run_folder import report_on
 
 
@@ -50,12 +51,24 @@ def recover_run(folder: Path) -> Recovered:
 
     The summary's verdict fails, for the run broke off.  A folder that is whole stays as it is.  Raises UserError where nothing
     was recorded, or the run still goes on, and OSError."""
-    recording, cut = folder / "run.mcap", folder / CUT
+    try:
+        held = lock(folder)
+    except BlockingIOError:
+        raise UserError(f"{folder}: a run is going on there") from None
+    try:
+        return _recover(folder)
+    finally:
+        os.close(held)
+
+
+def _recover(folder: Path) -> Recovered:
+    recording, cut = folder / RECORDING, folder / CUT
     if cut.exists() and not recording.exists():  # killed while it was mended
         os.replace(cut, recording)
     try:
-        _check_done(recording)
-        mended = folder / "run.mcap.mended"
+        if is_locked(recording):  # the recorder is left of a run whose supervisor was killed
+            raise UserError(f"{folder}: a run is going on there")
+        mended = folder / f"{RECORDING}.mended"
         result = recover(recording, mended)
         files: list[str] = []
         if result.complete and is_finished(recording):
@@ -63,7 +76,7 @@ def recover_run(folder: Path) -> Recovered:
         else:
             os.replace(recording, cut)
             os.replace(mended, recording)
-            files += ["run.mcap", CUT]
+            files += [RECORDING, CUT]
         if result.complete and _has_summary(folder):
             return Recovered(result, tuple(files))
         files += _rebuild(folder, recording, result)
@@ -73,27 +86,16 @@ def recover_run(folder: Path) -> Recovered:
         raise UserError(str(error)) from None
     failure = ""
     try:
-        report_on([folder], folder / "report.html")
-        files.append("report.html")
+        report_on([folder], folder / REPORT)
+        files.append(REPORT)
     except (UserError, OSError) as error:  # of a run that was killed early there may be nothing to report
         failure = f"no report: {error}"
     return Recovered(result, tuple(files), failure)
 
 
-def _check_done(recording: Path) -> None:
-    """Raises UserError while a recorder is writing the file."""
-    with recording.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(f"{recording}: is being written: the run goes on") from None
-        except OSError:  # a file system without locks
-            pass
-
-
 def _has_summary(folder: Path) -> bool:
     with suppress(OSError, ValueError):
-        read_summary(folder / "summary.json")
+        read_summary(folder / SUMMARY)
         return True
     return False
 
@@ -103,7 +105,7 @@ def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
     files: list[str] = []
     scenario = folder / EFFECTIVE
     if not scenario.exists() or not scenario.stat().st_size:
-        scenario.write_text(read_scenario(recording), encoding="utf-8")
+        write_text(scenario, read_scenario(recording))
         files.append(EFFECTIVE)
     _, plan = load(scenario)
     metadata = read_metadata(recording)
@@ -127,10 +129,10 @@ def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
         can = _report_of_log(plan, log, facts.clock)
         for bus, name in enumerate(dbc_names(plan)):
             if not (folder / name).exists():
-                (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
+                write_text(folder / name, plan_dbc(plan, bus))
                 files.append(name)
-    write_summary(summarise(trace, links, can, facts), folder / "summary.json")
-    return [*files, "summary.json"]
+    write_summary(summarise(trace, links, can, facts), folder / SUMMARY)
+    return [*files, SUMMARY]
 
 
 def _failure(trace: Trace, result: RecoverResult, counted: bool) -> str:

@@ -24,13 +24,16 @@ from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import PartRunError
+from echelon.files import write_text
 from echelon.messages import Message
 from echelon.plan.plan import Plan
 from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
+from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import interruption
 from echelon.sim.kept_parts import keep_parts
+from echelon.sim.out_folder import SUMMARY, OutFolder
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
 from echelon.sim.processes.supervisor import Outcome, Progress, Supervisor
@@ -45,33 +48,12 @@ from echelon.sim.view.live import Display
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions stand in a recording."""
-CUT: Final = "run.mcap.cut"
-"""The recording of a run that was killed, once it has been mended (echelon.sim.recovery)."""
-FILES: Final = ("scenario.toml", "run.json", "run.mcap", CUT, "can.log", "torque*.dbc", "summary.json", "report.html")
-"""What a run leaves, at most."""
-
-
-def new_folder(scenario: Scenario, out: Path | None) -> Path:
-    """Makes the folder of a run: `out`, or `runs/<scenario>-<utc time>`; what an earlier run left there goes, so that no
-    file of it is taken for this run's.  Raises OSError."""
-    if out is None:
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        out = Path("runs") / f"{scenario.name}-{stamp}"
-        count = 2
-        while out.exists():
-            out = Path("runs") / f"{scenario.name}-{stamp}-{count}"
-            count += 1
-    out.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
-        for path in out.glob(name):
-            path.unlink()
-    return out
 
 
 def execute(
     scenario: Scenario,
     plan: Plan,
-    folder: Path,
+    out: OutFolder,
     *,
     engine: str,
     clock: str,
@@ -84,10 +66,11 @@ def execute(
 
     A run ends at the first instant at which a robot's state is not finite, unless it is to `keep_going`.
     Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
-    begun = datetime.now(UTC)
+    begun, folder = datetime.now(UTC), out.path
     parts = keep_parts(scenario, folder)
     toml = effective_toml(scenario, parts.names)
-    (folder / "scenario.toml").write_text(toml, encoding="utf-8")
+    out.note((), {EFFECTIVE: toml, **parts.files})
+    write_text(folder / EFFECTIVE, toml)
     buses = dict(zip([bus.name for bus in plan.can.buses], can_urls, strict=False))  # without frames there are no URLs
     write_state(folder, engine, clock, buses)
     metadata = {
@@ -127,7 +110,7 @@ def execute(
     summary = summarise(
         outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun), parts.results
     )
-    write_summary(summary, folder / "summary.json")
+    write_summary(summary, folder / SUMMARY)
     return summary, outcome.trace
 
 

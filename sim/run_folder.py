@@ -1,11 +1,13 @@
 """Reads back the folder of a run."""
 
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.referee.referee import read_run_log
+from echelon.bridge.stations.closed import LOG
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
@@ -43,17 +45,34 @@ def open_run(folder: Path) -> Run:
     return Run(trace, summary, folder)
 
 
-def _for_report(folder: Path) -> RunForReport:
-    """Opens a run's folder for a report.  Raises UserError and OSError."""
+def runs_for_report(folders: Sequence[Path]) -> list[RunForReport]:
+    """Opens the folders of runs for a report.  Raises UserError and OSError."""
+    return [_for_report(folder, name) for folder, name in zip(folders, run_names(folders), strict=True)]
+
+
+def _for_report(folder: Path, name: str) -> RunForReport:
     run = open_run(folder)
     toml = (folder / EFFECTIVE).read_text(encoding="utf-8")
-    frames = first_frames(folder / "can.log", run.plan)
-    return RunForReport(folder.resolve().name, run.trace, run.summary, toml, frames)
+    return RunForReport(name, run.trace, run.summary, toml, first_frames(folder / LOG, run.plan))
 
 
-def report_on(folders: list[Path], path: Path) -> None:
+def run_names(folders: Sequence[Path]) -> list[str]:
+    """Returns what runs are called: the end of their folders' paths, as short as tells them apart; the same folder twice is
+    numbered."""
+    parts = [folder.resolve().parts for folder in folders]
+    different = len(set(parts))
+    for count in range(1, max(map(len, parts), default=1) + 1):
+        names = ["/".join(part[-count:]) for part in parts]
+        if len(set(names)) == different:
+            break
+    return [
+        f"{name} ({names[:at].count(name) + 1})" if names.count(name) > 1 else name for at, name in enumerate(names)
+    ]
+
+
+def report_on(folders: Sequence[Path], path: Path) -> None:
     """Writes a report of runs.  Raises UserError and OSError."""
-    write_report([_for_report(folder) for folder in folders], path)
+    write_report(runs_for_report(folders), path)
 
 
 def first_frames(path: Path, plan: Plan, count: int = FRAMES) -> tuple[dict[str, object], ...]:

@@ -9,7 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-FILE: Final = "run.json"
+from echelon.files import is_locked, write_text
+
+STATE: Final = "run.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +20,6 @@ class RunState:
 
     pid: int
     """Of the process that runs it, or supervises its processes"""
-    pid_start: int
-    """When that process began, in the kernel's clock ticks: another one may get its number later"""
     engine: str
     clock: str
     buses: dict[str, str]
@@ -28,30 +28,21 @@ class RunState:
 
 def write_state(folder: Path, engine: str, clock: str, buses: dict[str, str]) -> None:
     """Notes that this process begins a run.  Raises OSError."""
-    state = RunState(os.getpid(), _start_of(os.getpid()), engine, clock, buses)
-    (folder / FILE).write_text(json.dumps(asdict(state), indent=2) + "\n", encoding="utf-8")
+    state = RunState(os.getpid(), engine, clock, buses)
+    write_text(folder / STATE, json.dumps(asdict(state), indent=2) + "\n")
 
 
 def read_state(folder: Path) -> RunState | None:
     """Returns what is noted of a run; None if nothing is that can be read."""
     try:
-        return RunState(**json.loads((folder / FILE).read_text(encoding="utf-8")))
+        return RunState(**json.loads((folder / STATE).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
 
 
 def goes_on(folder: Path) -> bool:
-    """True while a run has not written its summary yet, and its process is there."""
-    state = read_state(folder)
-    if state is None or (folder / "summary.json").exists():
-        return False
-    return _start_of(state.pid) == state.pid_start
-
-
-def _start_of(pid: int) -> int:
-    """Returns when a process began, in the kernel's clock ticks since it booted; -1 if there is no such process."""
+    """True while a run holds its folder and has not written its summary yet."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text()
+        return not (folder / "summary.json").exists() and is_locked(folder)
     except OSError:
-        return -1
-    return int(text.rpartition(")")[2].split()[19])  # its name, in parentheses, may hold anything
+        return False

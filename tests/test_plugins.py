@@ -1,4 +1,4 @@
-"""Parts from files: found, checked, carried to other processes by their text, and named when they are wrong."""
+"""Parts from files: they are found and checked, their text travels to other processes, and errors name them."""
 
 import pickle
 import sys
@@ -46,7 +46,7 @@ USE_PLANT = 'robot.model={use="my_plants.py:Sticky",parameters={share=0.5}}'
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A user's folder: a scenario, parts, and files whose names others have too."""
+    """Returns a user's folder with a scenario, parts, and files with the names of installed modules."""
     (tmp_path / "mine.toml").write_text((SCENARIOS / "lab.toml").read_text())
     (tmp_path / "my_paths.py").write_text(SPIRAL)
     (tmp_path / "my_plants.py").write_text(PLANT)
@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def untried(folder: Path, *overrides: str) -> Plan:
-    """Returns a plan whose parts have not been tried (echelon.sim.parts.probe)."""
+    """Returns a plan without a trial of its parts (echelon.sim.parts.probe)."""
     return echelon.planning.loading.load(folder / "mine.toml", overrides, REGISTRY)[1]
 
 

@@ -1,4 +1,4 @@
-"""Control laws: what one is (`law`), and those that are built in."""
+"""Control laws: their base class (`law`), and the built-in laws."""
 
 from typing import Final
 
@@ -13,6 +13,6 @@ LAWS: Final[dict[str, type[Plugin]]] = {
     "integral": Integral,
     "terminal_sliding": TerminalSliding,
 }
-"""What is built in, by name."""
+"""The built-in laws by name."""
 
 __all__ = ["LAWS", "Block", "Integral", "Law", "Linear", "LinearGains", "TerminalSliding"]

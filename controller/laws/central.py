@@ -1,4 +1,5 @@
-"""The law of all blocks with all robots seen at once: what the tree computes in a distributed way."""
+"""The central law: computes from all positions at once what the tree computes in a distributed way (docs/architecture.md,
+2.4)."""
 
 import numpy as np
 
@@ -10,13 +11,13 @@ from echelon.plan.plan import Array, Plan
 
 
 class CentralLaw:
-    """a = Φ_M⁻¹ Z̈ with Z̈ of every block as `controller.laws.law` has it: the reference for tests, for analysis, and for anyone
-    who wants to compare.
+    """a = Φ_M⁻¹ Z̈, where Z̈ of every block is given in `controller.laws.law`.  It is the reference for tests and for analysis.
 
-    A law with a state integrates with every call: call it once per period, the same for all nodes; `reset` begins anew."""
+    A law with a state integrates at every call.  So it must be called once per period, and all nodes must have the same
+    period; `reset` sets the states to zero again."""
 
     def __init__(self, plan: Plan, lead: float | None = None) -> None:
-        """Takes the law of a plan; with `lead` [periods] instead of the plan's, if given."""
+        """Takes the law of a plan; `lead` [periods] replaces that of the plan."""
         self.plan = plan
         self.transformation = Transformation(plan)
         self.trajectory = make_trajectory(plan.trajectory)
@@ -28,11 +29,12 @@ class CentralLaw:
         self.reset()
 
     def reset(self) -> None:
-        """Sets the states of all blocks to zero, as they are at the start."""
+        """Sets the law's states of all blocks to zero, their values at the start."""
         self.states = [make_state(self.plan.law, block) for block in self._blocks]
 
     def __call__(self, t: float, positions: Array, velocities: Array) -> Array:
-        """Returns accelerations a, (N, 2) [m/s²], for positions and velocities of the reference points, (N, 2)."""
+        """Returns the robots' accelerations a, (N, 2) [m/s²], at t [s], for the positions [m] and velocities [m/s] of the
+        reference points, (N, 2)."""
         cbt = self.transformation
         z_cd = self.trajectory.at(t)
         e = (cbt.forward(positions) - cbt.desired(z_cd[0])).ravel()

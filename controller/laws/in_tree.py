@@ -1,8 +1,8 @@
-"""A law in the tree: what of it is matrices, and what a node must ask block by block.
+"""A law as a node of the tree uses it: the part that is matrices, and the part that is computed for each block in each period.
 
-Of the linear law all is matrices; a node multiplies them out once (`controller.node.NodeLaw`).  Of any other law coupling and
-avoidance still are.  The rest, η = ν - Z̈_bd of the node's own blocks, is asked for in each period and turned into a part of its
-children's accelerations, Φ_node⁻¹ η.
+The linear law consists of matrices only; a node multiplies them out once (`controller.node.NodeLaw`).  In any other law
+coupling and avoidance are matrices as well.  The rest is η = ν - Z̈_bd of the node's own blocks.  It is computed in each period
+and gives a part of the children's accelerations, Φ_node⁻¹ η.
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,22 @@ from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan
 
 @dataclass(frozen=True, slots=True)
 class BlockGains:
-    """The matrices of one block, as they act: K_1 [1/s²] and K_2 [1/s], zero unless the law is the linear one; the row
-    W K̄_b of the coupling [1/s]; W k_b [1/s]."""
+    """The matrices of one block as they act, look-ahead and W (controller.laws.law) included."""
 
     K_1: Array
+    """Gain of the error [1/s²], (size, size); zero if the law is not the linear one"""
     K_2: Array
+    """Gain of the error's rate [1/s], (size, size); zero if the law is not the linear one"""
     K_coupling: Array
+    """W K̄_b, the rows of the coupling that act on the block [1/s], (size, 2 N)"""
     K_pot: Array
+    """W/σ, the gain of F_pot [1/s], (size, size)"""
 
     @classmethod
     def of(cls, plan: Plan, block: BlockPlan, lead: float | None = None) -> "BlockGains":
-        """Returns the matrices of a block of a plan; with `lead` [periods] instead of the plan's, if given."""
+        """Returns the matrices of a block of a plan; `lead` [periods] replaces that of the plan.
+
+        Raises PartRunError if the law's W is wrong."""
         rows = slice(block.offset, block.offset + block.size)
         seen = law_block(plan, block, lead)
         if is_linear(plan):
@@ -40,12 +45,12 @@ class BlockGains:
 
 
 def is_linear(plan: Plan) -> bool:
-    """True if the plan's law is the linear one itself, which has no state and is all matrices."""
+    """True if the plan's law is `Linear`, which has no state and consists of matrices only."""
     return type(plan.law.made) is Linear
 
 
 class NodeBlocks:
-    """The blocks of one node, under a law that is not all matrices."""
+    """The blocks of one node under a law that does not consist of matrices only."""
 
     def __init__(self, plan: Plan, node: NodePlan) -> None:
         count = len(node.children)
@@ -66,13 +71,14 @@ class NodeBlocks:
 
     @classmethod
     def of(cls, plan: Plan, node: NodePlan) -> "NodeBlocks | None":
-        """Returns the blocks of a node; None if the plan's law is all matrices."""
+        """Returns the blocks of a node; None if the plan's law is `Linear`."""
         return None if is_linear(plan) else cls(plan, node)
 
     def __call__(self, t: float, s: Array, c: Array) -> Array:
-        """Returns Φ_node⁻¹ η, what the law adds to the children's accelerations at t [s], (2 n,) [m/s²].
+        """Returns Φ_node⁻¹ η, (2 n,) [m/s²]: the law's part of the children's accelerations at t [s].
 
-        s are positions and velocities of the n children, (4 n,); c is (z_cd, ż_cd, z̈_cd), (6,), where the node is the root."""
+        `s`, (4 n,), are the positions and velocities of the n children.  `c` is (z_cd, ż_cd, z̈_cd), (6,), at the root; other
+        nodes do not use it."""
         errors = (self._errors_of_s @ s).reshape(-1, 4) - self._desired
         feed_forward = np.zeros((len(errors), 2))
         if self._is_root:

@@ -1,17 +1,17 @@
-"""The linear law with integral action: it leaves no constant error where something constant pushes.
+"""The linear law with integral action: a constant disturbance leaves no constant error.
 
 For every block, with the integral q of its error,
 
     ν = Z̈_bd - K_1 e - K_2 ė - K_i q        q̇ = e        K_i = k_i/σ³
 
-A constant acceleration w that nobody planned (a slope, friction, a load) leaves the linear law at e = K_1⁻¹ w.  Here q takes
-it over: at rest q̇ = e = 0 and K_i q = w.  All gains scale with σ, so all blocks have one characteristic polynomial in σ s,
-for gains that are numbers p³ + K_f2 p² + K_f1 p + k_i.  By Routh and Hurwitz it is stable if and only if
+Under a constant disturbing acceleration w (a slope, friction, a load) the linear law keeps the error e = K_1⁻¹ w.  Here q
+compensates for it: at rest q̇ = e = 0 and K_i q = w.  All gains scale with σ, so all blocks have the same characteristic
+polynomial in p = σ s, for gains that are numbers p³ + K_f2 p² + K_f1 p + k_i.  By Routh and Hurwitz it is stable if and only if
 
     0 < k_i < K_f1 K_f2
 
-*Integration.*  Once per period, after ν: q ← q + T e + T²/2 ė.  It stands still only where e = 0 (and ė = 0), so the sampled
-loop leaves no constant error either.
+*Integration.*  Once per period, after ν: q ← q + T e + T²/2 ė.  A constant q needs e = 0 (and ė = 0), so the sampled loop
+leaves no constant error either.
 
 *Look-ahead* (`controller.laws.linear`).  With η = ν - Z̈_bd held and h = λT,
 
@@ -20,8 +20,8 @@ loop leaves no constant error either.
     η = M (-(K_1 + h K_i) e - (K_2 + h K_1 + h²/2 K_i) ė - K_i q - Σ K̄_bb' ė_b' + k_b F_pot,b)
     M = (I + h K_2 + h²/2 K_1 + h³/6 K_i)⁻¹
 
-*Windup.*  Each number of K_i q stays within ± `limit` [m/s²]: after each period q is cut off there.  So a disturbance of more
-than `limit` leaves a constant error, and a robot that cannot follow for a while does not pay for it for long.
+*Windup.*  After each period q is clipped so that each number of K_i q stays within ± `limit` [m/s²].  So a disturbance above
+`limit` leaves a constant error; and after a time in which a robot could not follow, its q is not large and decays soon.
 """
 
 from typing import ClassVar
@@ -39,16 +39,16 @@ class Integral(Law):
     uses: ClassVar[frozenset[str]] = frozenset({"gains", "lead"})
 
     k_i: Positive
-    """K_i = k_i/σ³; stable in continuous time if less than k1 k2 of `law.gains`"""
+    """Gain of the integral, K_i = k_i/σ³; in continuous time the law is stable if k_i is less than k1 k2 of `law.gains`"""
     limit: Positive = 1.0
-    """Largest acceleration that the integral asks for, for each number of a block [m/s²]"""
+    """Largest acceleration that the integral can give, for each number of a block [m/s²]"""
 
     def nu(self, block: Block, t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
-        """Returns ν [m/s²], (size,), and integrates: `state` is q [m s]."""
+        """Returns ν [m/s²], (size,), and integrates once: `state` is q [m s]."""
         return self.nu_of(block)(t, e, e_dot, feed_forward, state)
 
     def nu_of(self, block: Block) -> Nu:
-        """Returns ν of one block, its gains multiplied out once."""
+        """Returns ν of one block, with its gains computed once."""
         gains, T = self.linear(block), block.period_s
         bound = self.limit * block.sigma**3 / self.k_i
 
@@ -61,15 +61,15 @@ class Integral(Law):
         return nu
 
     def state_size(self, block: Block) -> int:
-        """Returns the size of q: one number for each of e."""
+        """Returns the size of q, which is that of e."""
         return block.size
 
     def weight(self, block: Block) -> Array:
-        """Returns W = M: with look-ahead, coupling and avoidance act through it."""
+        """Returns W = M of the look-ahead."""
         return self.linear(block).weight
 
     def linear(self, block: Block) -> LinearGains:
-        """Returns the gains as they act, with look-ahead multiplied out and q within its bounds."""
+        """Returns the gains with look-ahead multiplied out; they hold while q is within its bounds."""
         h, unit = block.ahead_s, np.eye(block.size)
         K_1, K_2, K_i = block.K_1, block.K_2, self.k_i / block.sigma**3 * unit
         m: Array = np.asarray(np.linalg.inv(unit + h * K_2 + h**2 / 2 * K_1 + h**3 / 6 * K_i))

@@ -1,11 +1,12 @@
-"""What a control law is: for one block of the transformed state, from the error to ν, the wanted Z̈_b [m/s²].
+"""The base class of control laws.  A law computes ν, the wanted Z̈_b [m/s²] of one block of the transformed state, from the
+block's error.
 
-Around it the tree stays as it is (docs/architecture.md, 2.3): it adds coupling and avoidance to ν, and turns the ν of all
-blocks into accelerations of robots.  With the error e = Z_b - Z_bd the acceleration of block b is
+The tree is the same for all laws (docs/architecture.md, 2.3): it adds coupling and avoidance to ν, and turns the results of
+all blocks into accelerations of robots.  With the error e = Z_b - Z_bd the acceleration of block b is
 
     Z̈_b = ν_b(t, e_b, ė_b, Z̈_bd) + W_b (-Σ_{b'≠b} K̄_bb' ė_b' + F_pot,b/σ_b)
 
-where W_b is the unit matrix unless the law says otherwise.  To add a law, derive a class from `Law` (docs/add-a-law.md).
+where W_b is the unit matrix unless the law defines another.  To add a law, derive a class from `Law` (docs/add-a-law.md).
 """
 
 from abc import ABC, abstractmethod
@@ -26,35 +27,35 @@ class Block:
     """A block as a law sees it."""
 
     name: str
-    """`g1` of a group's shape, `inter`, `centroid`"""
+    """Name of the block: `g1` for the shape of the group g1, `inter`, `centroid`"""
     layer: str
     """`intra`, `middle`, `inter` or `centroid`"""
     size: int
-    """How many numbers e has: x and y of each variable"""
+    """Number of values of e: x and y of each variable"""
     sigma: float
     """σ, the block's time scale [s]"""
     period_s: float
-    """T, for which ν is held [s]"""
+    """T, the period for which ν is held [s]"""
     lead: float
-    """λ of `law.lead`, how far to look ahead, in periods"""
+    """λ of `law.lead`, how far the law looks ahead, in periods"""
     K_1: Array
-    """K_f1/σ² [1/s²] of `law.gains`, (size, size)"""
+    """K_f1/σ² [1/s²], (size, size), from `law.gains`"""
     K_2: Array
-    """K_f2/σ [1/s] of `law.gains`, (size, size)"""
+    """K_f2/σ [1/s], (size, size), from `law.gains`"""
 
     @property
     def ahead_s(self) -> float:
-        """λ T, how far to look ahead [s]."""
+        """λ T, how far the law looks ahead [s]."""
         return self.lead * self.period_s
 
 
 @dataclass(frozen=True, slots=True)
 class LinearGains:
-    """A law that is linear, with look-ahead multiplied out:
+    """The gains of a linear law, with look-ahead multiplied out; all matrices are (size, size).
 
         ν = Z̈_bd - K_1 e - K_2 ė - K_i q        q ← q + T e + T²/2 ė    after each period
 
-    and W = `weight`; matrices (size, size)."""
+    `weight` is the law's W."""
 
     K_1: Array
     K_2: Array
@@ -63,42 +64,44 @@ class LinearGains:
 
 
 Nu = Callable[[float, Array, Array, Array, Array], Array]
-"""(t [s], e [m], ė [m/s], Z̈_bd [m/s²], own state) → ν [m/s²]"""
+"""(t [s], e [m], ė [m/s], Z̈_bd [m/s²], state of the law) → ν [m/s²]"""
 
 
 class Law(Plugin, ABC):
-    """Base of all control laws; the fields of a class are its parameters."""
+    """Base class of all control laws.  The fields of a class are its parameters."""
 
     uses: ClassVar[frozenset[str]] = frozenset()
-    """Which of the keys `gains` and `lead` of `[law]` it makes use of; a scenario that sets another one is refused"""
+    """The keys `gains` and `lead` of `[law]` that the law uses.  A scenario that sets one that is not used is refused"""
 
     @abstractmethod
     def nu(self, block: Block, t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
         """Returns ν [m/s²], (size,), for the error e [m] and its rate ė [m/s] at t [s].
 
-        `feed_forward` is Z̈_bd [m/s²], zero for shapes.  `state` is the block's own: `state_size` numbers, zero at the start.
-        The law may write into it.  It is called once in each period T of the block's node, but not in one in which the node
-        misses a message and commands nothing.  The other arrays are read-only."""
+        `feed_forward` is Z̈_bd [m/s²], zero for shapes.  `state` is the law's state of this block: `state_size` numbers, zero at
+        the start.  The law may write into it; the other arrays are read-only.
+
+        `nu` is called once in each period T of the block's node.  It is not called in a period in which the node misses a
+        message, because then the node commands nothing."""
 
     def nu_of(self, block: Block) -> Nu:
-        """Returns `nu` of one block; to be overridden where something can be computed once per block."""
+        """Returns `nu` of one block.  A class may override this to compute values once per block."""
         return partial(self.nu, block)
 
     def state_size(self, block: Block) -> int:
-        """Returns how many numbers the law keeps for a block."""
+        """Returns the number of values in the law's state of a block."""
         return 0
 
     def weight(self, block: Block) -> Array:
-        """Returns W, (size, size): how coupling and avoidance enter Z̈_b beside ν."""
+        """Returns W, (size, size): the matrix by which coupling and avoidance enter Z̈_b."""
         return np.eye(block.size)
 
     def linear(self, block: Block) -> LinearGains | None:
-        """Returns the law's gains if it is linear, for analysis; None if it is not."""
+        """Returns the gains of a linear law, for analysis; None if the law is not linear."""
         return None
 
 
 def law_block(plan: Plan, block: BlockPlan, lead: float | None = None) -> Block:
-    """Returns a block of a plan as a law sees it; with `lead` [periods] instead of the plan's, if given."""
+    """Returns a block of a plan as a law sees it; `lead` [periods] replaces that of the plan."""
     node = plan.root if block.node is None else plan.formation[block.node]
     K_1, K_2 = block.k1 / block.sigma**2, block.k2 / block.sigma
     K_1.flags.writeable = K_2.flags.writeable = False
@@ -107,13 +110,13 @@ def law_block(plan: Plan, block: BlockPlan, lead: float | None = None) -> Block:
 
 
 _HUGE: Final = 1e12
-"""Where a law that others wrote may fail because the run's numbers ran away"""
+"""From this magnitude of its inputs on a law that is not built in may fail: the run has diverged"""
 
 
 def make_nu(part: Part[Any], block: Block) -> Nu:
-    """Returns ν of a plan's law for a block; that of a law that is not built in has its answers checked.
+    """Returns ν of a plan's law for a block.  The answers of a law that is not built in are checked.
 
-    Raises PartRunError if the law cannot make it."""
+    Raises PartRunError if `nu_of` of the law raises."""
     law: Law = part.made
     if part.is_own:
         return law.nu_of(block)
@@ -126,7 +129,7 @@ def make_nu(part: Part[Any], block: Block) -> Nu:
 
 
 def make_state(part: Part[Any], block: Block) -> Array:
-    """Returns the state that a plan's law starts with, zeros.  Raises PartRunError if the law gives no size."""
+    """Returns the state of a plan's law for a block at the start: zeros.  Raises PartRunError if `state_size` is wrong."""
     law: Law = part.made
     who = f"{part.use} of block {block.name}"
     try:
@@ -139,7 +142,7 @@ def make_state(part: Part[Any], block: Block) -> Array:
 
 
 def make_weight(part: Part[Any], block: Block) -> Array:
-    """Returns W of a plan's law for a block.  Raises PartRunError if the law gives none."""
+    """Returns W of a plan's law for a block.  Raises PartRunError if `weight` is wrong."""
     law: Law = part.made
     who, shape = f"{part.use} of block {block.name}", (block.size, block.size)
     try:
@@ -154,23 +157,23 @@ def make_weight(part: Part[Any], block: Block) -> Array:
 
 
 def _checked(nu: Nu, size: int, who: str) -> Nu:
-    """Returns ν that raises PartRunError if, for numbers that a run can have, it raises or returns anything but `size` finite
-    numbers.  For numbers that ran away it may fail: then the answer is not a number."""
+    """Returns `nu` with its answers checked: it raises PartRunError if `nu` raises, or returns anything but `size` finite
+    numbers.  In a run that has diverged (inputs from `_HUGE` on) `nu` may fail; then the answer is NaN."""
 
     def checked(t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
-        lost = not all(np.abs(given).max() < _HUGE for given in (e, e_dot, feed_forward))
+        diverged = not all(np.abs(given).max() < _HUGE for given in (e, e_dot, feed_forward))
         try:
             given = nu(t, e, e_dot, feed_forward, state)
             answer = np.asarray(given, dtype=np.float64)
         except Exception as error:
-            if lost:
+            if diverged:
                 return np.full(size, np.nan)
             raise PartRunError(f"{who}: nu at t = {t:g} s raised {type(error).__name__}: {error}") from error
         if given is None:
             raise PartRunError(f"{who}: nu at t = {t:g} s returned nothing; it must return {size} numbers")
         if answer.shape != (size,):
             raise PartRunError(f"{who}: nu at t = {t:g} s has the shape {answer.shape}, not ({size},)")
-        if not lost and not np.isfinite(answer).all():
+        if not diverged and not np.isfinite(answer).all():
             raise PartRunError(f"{who}: nu at t = {t:g} s is not finite: {answer.tolist()!s:.120}")
         return answer
 

@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from echelon.cli.options import Command, argument, option
 from echelon.cli.shared import JSON
@@ -23,21 +23,53 @@ class ReportOptions:
         default=None,
         metadata=option("where to write it (default: report.html in the run's folder, or here for several)", "FILE"),
     )
+    figures: Path | None = field(
+        default=None,
+        metadata=option("write each figure as a file into a folder, and no page unless --out is given", "DIR"),
+    )
+    format: tuple[Literal["svg", "pdf", "png"], ...] = field(
+        default=(), metadata=option("of the files of --figures; may be repeated (default: svg)")
+    )
     json: bool = field(default=False, metadata=JSON)
 
 
 def report(options: ReportOptions) -> int:
-    """Writes the report of a run, or a comparison of several."""
-    from echelon.sim.run_folder import report_on
+    """Writes the report of a run, or a comparison of several; or its figures, each as a file."""
+    from echelon.sim.report.report import save_figures, write_report
+    from echelon.sim.run_folder import runs_for_report
 
-    alone = options.runs[0] / "report.html" if len(options.runs) == 1 else Path("report.html")
-    path = options.out or alone
+    if options.format and options.figures is None:
+        raise UsageError(f"--format {options.format[0]}: is of the files of --figures DIR")
+    path = options.out
+    if path is None and options.figures is None:
+        path = options.runs[0] / "report.html" if len(options.runs) == 1 else Path("report.html")
+        if not _may_replace(path):
+            raise UsageError(f"{path}: is there, and no report of echelon's; give another file with --out")
+    runs, written = runs_for_report(options.runs), list[Path]()
     try:
-        report_on(list(options.runs), path)
+        if options.figures is not None:
+            written = save_figures(runs, options.figures, options.format or ("svg",))
+        if path is not None:
+            write_report(runs, path)
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
-    print(json.dumps({"report": str(path), "runs": list(map(str, options.runs))}) if options.json else path)
+        raise UsageError(f"{error.filename or path}: {error.strerror}") from None
+    if options.json:
+        page = None if path is None else str(path)
+        print(json.dumps({"report": page, "figures": list(map(str, written)), "runs": list(map(str, options.runs))}))
+    else:
+        print(*written, *(() if path is None else (path,)), sep="\n")
     return 0
+
+
+def _may_replace(path: Path) -> bool:
+    """Returns whether there is no file at `path`, or a report of ours."""
+    from echelon.sim.report.page import GENERATOR
+
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return GENERATOR in file.read(1000)
+    except OSError:  # none, or one that cannot be written to either
+        return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,11 +176,13 @@ COMMANDS: Final[tuple[Command[Any], ...]] = (
         options=ReportOptions,
         work=report,
         about="""\
-Writes a page with figures, tables and the verdict of a run, or of several runs side by side.
-It needs no other file and no network.""",
+Writes a page with figures, tables and the verdict of a run.  Of several runs it says what
+differs, and shows their curves in the same figures.  It needs no other file and no network.
+A report.html that is no report is not overwritten.""",
         examples={
             "echelon report runs/demo": "runs/demo/report.html, written again",
-            "echelon report runs/demo runs/avoiding --out both.html": "two runs side by side",
+            "echelon report runs/demo runs/avoiding --out both.html": "two runs compared",
+            "echelon report runs/demo --figures figures --format pdf": "trajectories.pdf and the others",
         },
         codes={0: "written"},
     ),

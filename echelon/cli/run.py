@@ -23,6 +23,9 @@ class RunOptions(ScenarioOptions):
     out: Path | None = field(
         default=None, metadata=option("folder of the run (default: runs/<scenario>-<utc time>)", "DIR")
     )
+    replace: bool = field(
+        default=False, metadata=option("delete the run of another scenario that the folder of --out holds")
+    )
     can: str | None = field(
         default=None,
         metadata=option(
@@ -68,6 +71,7 @@ def run(options: RunOptions) -> int:
                 quiet=options.quiet,
                 stall_timeout_s=options.stall_timeout,
                 keep_going=options.keep_going,
+                replace=options.replace,
             ),
         )
     except OSError as error:

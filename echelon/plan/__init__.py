@@ -1,1 +1,1 @@
-"""What roles need to know of a run: plain frozen data, made once from a scenario (echelon.planning.plan_maker)."""
+"""The plan of a run: frozen data for all roles, made once from a scenario (echelon.planning.plan_maker)."""

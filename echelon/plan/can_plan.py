@@ -1,4 +1,4 @@
-"""The part of a plan that concerns the CAN bus: motors, drives, envelopes, buses, events, and who is in between."""
+"""The part of a plan that concerns the CAN bus: motors, drives, envelopes, buses, events, and the roles bridge and drives."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Protocol
@@ -6,94 +6,96 @@ from typing import Any, ClassVar, Final, Protocol
 from echelon.plugins import Part
 
 NEVER_NS = 1 << 62
-"""Later than any instant of a run."""
+"""An instant later than any instant of a run [ns]"""
 
 
 @dataclass(frozen=True, slots=True)
 class MotorPlan:
-    """The motor of a wheel and its power stage, SI units, temperatures in °C."""
+    """The motor of a wheel and its power stage, in SI units; temperatures in °C."""
 
     torque_limit: float
     """Largest shaft torque [N m]"""
     rated_torque: float
-    """Torque it can give for ever [N m]"""
+    """Torque that the motor can hold without time limit [N m]"""
     torque_slew: float
-    """Largest change of the setpoint [N m/s]"""
+    """Largest rate of change of the setpoint [N m/s]"""
     lag: float
     """Time constant of the current loop [s]; 0: the torque follows at once"""
     torque_constant: float
-    """K_t [N m/A]"""
+    """Torque constant K_t [N m/A]"""
     resistance: float
-    """Of the winding [Ω]: it is heated by resistance · current²"""
+    """Resistance of the winding [Ω]; it is heated by resistance · current²"""
     thermal_resistance: float
-    """Winding to ambient [K/W]"""
+    """Thermal resistance from winding to ambient [K/W]"""
     thermal_time: float
     """Time constant of the winding's temperature [s]"""
     ambient: float
+    """Temperature around the motor [°C]"""
     derating_from: float
-    """The torque limit falls linearly to zero from here to `temperature_limit`"""
+    """Winding temperature from which the torque limit falls, linearly to zero at `temperature_limit` [°C]"""
     temperature_limit: float
-    """Over-temperature fault from here on"""
+    """Winding temperature at which the drive raises an over-temperature fault [°C]"""
     supply_voltage: float
+    """Supply voltage without load [V]"""
     supply_resistance: float
-    """Of battery and cables [Ω]: the bus voltage falls with the current that the motor draws"""
+    """Resistance of battery and cables [Ω]; the supply voltage falls with the current that the motor draws"""
     brown_out: float
-    """Under this bus voltage the drive gives up [V]"""
+    """Supply voltage below which the drive raises a brown-out fault [V]"""
     encoder_counts: int
-    """Per revolution of the wheel"""
+    """Encoder counts per revolution of the wheel"""
     inertia: float
-    """What the motor turns where no robot does [kg m²]: a wheel on a bench"""
+    """Inertia of a wheel that turns freely on a bench, without a robot [kg m²]"""
     friction: float
-    """The same wheel's friction [N m s/rad]"""
+    """Viscous friction of a wheel on a bench [N m s/rad]"""
 
 
 class Addressing(Protocol):
-    """What planning asks of a drive protocol (bridge.protocols.protocol.DriveProtocol): where drives are on a bus."""
+    """The part of a drive protocol (bridge.protocols.protocol.DriveProtocol) that planning uses: its use of identifiers."""
 
     wheels: ClassVar[tuple[tuple[int, ...], ...]]
     """The wheels (0 right, 1 left) of each drive of a robot"""
     nodes: ClassVar[range]
     """Node ids that a drive may have"""
     by_number: ClassVar[bool]
-    """A robot's number is the node id of its drives, which cannot be chosen"""
+    """True if the node id of a robot's drives is the robot's number and cannot be chosen"""
 
     def identifiers(self, node: int) -> frozenset[int]:
-        """Returns the identifiers of the frames that a node alone sends or is sent."""
+        """Returns the identifiers of the frames that only this node sends or receives."""
 
     def shared_identifiers(self) -> frozenset[int]:
         """Returns the identifiers that all drives of the protocol on a bus share."""
 
     def refuses(self, motor: MotorPlan) -> str:
-        """Returns what the protocol cannot say of a motor, beginning with the key; empty if it can say all."""
+        """Returns why the protocol cannot be used with a motor, beginning with the key; an empty string if it can."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrivePlan:
-    """The drives of a robot's wheels: their protocol, their place on the bus, their motor (both wheels have the same)."""
+    """The drives of a robot's wheels.  The motors of both wheels are alike."""
 
     protocol: Part[Any]
     """A bridge.protocols.protocol.DriveProtocol"""
     bus: int
-    """Which of the plan's buses"""
+    """Number of the bus in the plan"""
     node_ids: tuple[int, int]
-    """Of the right and the left wheel's drive; twice the same where one drive has both wheels"""
+    """Node ids of the right and the left wheel's drive; the same number twice if one drive has both wheels"""
     period_ns: int
-    """Between two torque frames, and between two feedback frames"""
+    """Time between two torque frames, and between two feedback frames [ns]"""
     watchdog_ns: int
-    """A drive that hears no command for so long stops, and stays stopped"""
+    """A drive that receives no command for this time takes the torque away and latches a fault [ns]"""
     torque_scale: float
-    """Of frames with torques in whole numbers [N m per bit]"""
+    """Torque per bit in frames that hold torques as whole numbers [N m]"""
     recover_ns: int | None
-    """So long after a fault the host clears it and enables the drive anew; None: never"""
+    """Time after a fault at which the host clears it and enables the drive again [ns]; None: never"""
     motor: MotorPlan
 
 
 @dataclass(frozen=True, slots=True)
 class EnvelopePlan:
-    """What the last gate before the bus lets pass, for each wheel."""
+    """Limits of the last gate before the bus, for each wheel."""
 
     torque_limit: float
-    """[N m]"""
+    """Largest magnitude of a torque [N m]"""
     rise_limit: float
     """Largest growth of a torque's magnitude from frame to frame [N m]"""
     fall_limit: float
@@ -101,12 +103,12 @@ class EnvelopePlan:
     window_limit: float
     """Largest difference between two torques within 250 ms [N m]"""
     stale_ns: int
-    """Oldest command that may still become a frame"""
+    """Largest age of a command that may still become a frame [ns]"""
 
 
 @dataclass(frozen=True, slots=True)
 class BusPlan:
-    """A CAN bus: its name, where it is, how fast [bit/s]."""
+    """A CAN bus: its name, its address, its bit rate [bit/s]."""
 
     name: str
     url: str
@@ -115,7 +117,10 @@ class BusPlan:
 
 @dataclass(frozen=True, slots=True)
 class CanPlan:
-    """The buses, and the way of the torques: `mirror` or `closed`, frames taking time as on a real bus (`bits`) or none."""
+    """The buses, and the path of the torques.
+
+    `path` is `mirror` or `closed`.  `timing` is `bits` (frames take time as on a real bus) or `ideal` (they take none).  The
+    other fields are those of the scenario's table `can` (echelon.scenario.can_tables), times in nanoseconds."""
 
     enabled: bool
     buses: tuple[BusPlan, ...]
@@ -123,7 +128,7 @@ class CanPlan:
     path: str
     timing: str
     paced: bool
-    """On a wall clock, too, frames take as long as `timing` says; otherwise the bus takes its own time"""
+    """True if frames take as long as `timing` says on a wall clock as well; otherwise the bus takes its own time there"""
     virtual_drives: bool
     watchdog_ns: int
     bring_up_ns: int
@@ -137,12 +142,13 @@ class CanPlan:
 
 
 DISTURBANCES: Final = ("error_frames", "bus_off")
-"""Kinds of events that buses suffer."""
+"""Kinds of events that disturb a bus"""
 
 
 @dataclass(frozen=True, slots=True)
 class EventPlan:
-    """Something that happens from `at_ns` until `until_ns`: a kind and what it needs (echelon.scenario.can_tables)."""
+    """A scheduled event from `at_ns` until `until_ns`.  Its kinds, and the fields that each needs, are in
+    echelon.scenario.can_tables."""
 
     kind: str
     at_ns: int
@@ -162,14 +168,14 @@ class BusRolePlan:
     role: str
     period_ns: int
     first_ns: int
-    """When it begins, before the run: drives are brought up until 0"""
+    """Run time at which it begins [ns]; negative, because the drives are brought up before run time 0"""
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Its name in texts: the role."""
         return self.role
 
     @property
     def path(self) -> str:
-        """Its place among the keys, which no group can have."""
+        """Its place in the keys of messages; no group can have this path."""
         return f"@{self.role}"

@@ -1,10 +1,10 @@
-"""Layouts: where each part of a message stands among its values, and how many values a message has.
+"""Layouts: the place of each part of a message among its values, and the number of values of a message.
 
-A message is one run of float64 (`echelon.messages`).  How it is divided follows from the plan and from who says it: whoever
-writes it and whoever reads it compute the same layout, once.  Parts are slices; a part that the plan does without is empty.
+The values of a message are one array of float64 (`echelon.messages`).  Its parts follow from the plan and from the sender, so
+sender and receiver compute the same layout, once per run.  Parts are slices; a part that the plan does not need is empty.
 
-On the way up, what a child says of the blocks and robots below it becomes a part of what its node says (`Carried`).  On the
-way down, a child node finds a part of its own in its parent's REFERENCE (`ReferencePart`).
+On the way up the tree, parts of a child's message are copied into the message of its node (`Carried`).  On the way down, a
+node takes its own part from the REFERENCE of its parent (`ReferencePart`).
 """
 
 from collections.abc import Iterator
@@ -16,32 +16,32 @@ from echelon.plan.can_plan import BusRolePlan
 from echelon.plan.plan import NodePlan, Plan, RobotPlan
 
 CENTROID: Final = slice(0, len(GROUP_FIELDS))
-"""`GROUP_FIELDS` of a child: in the GROUP_STATE of a node, and in the STATE of a robot, which begins with the same fields"""
+"""Place of `GROUP_FIELDS` in the GROUP_STATE of a node, and in the STATE of a robot, which begins with the same fields"""
 POSITION: Final = slice(0, 2)
-"""Position (x, y) of a robot in its STATE"""
+"""Place of a robot's position (x, y) in its STATE"""
 
 
 @dataclass(frozen=True, slots=True)
 class GroupStateLayout:
-    """GROUP_STATE of a node; of the root, which has no parent to say it to, what it knows in the same order."""
+    """The layout of a node's GROUP_STATE.  The root sends none, but keeps the same values in this order."""
 
     centroid: slice
     """`GROUP_FIELDS`"""
     rates: slice
-    """Error rates (x, y) of the blocks below, child by child, then of the node's own shape, then, at the root, of the
-    centroid, so that the root has those of all blocks; only where blocks are coupled"""
+    """Error rates (x, y): of the blocks below, child by child; then of the node's own shape; then, at the root, of the
+    centroid.  So the root has those of all blocks.  Empty if no blocks are coupled"""
     own_rates: slice
-    """Those of the node's own shape"""
+    """Error rates of the node's own shape, a part of `rates`"""
     centroid_rates: slice
-    """Those of the centroid; only at the root"""
+    """Error rates of the centroid, a part of `rates`; empty but at the root"""
     positions: slice
-    """Positions (x, y) of the robots below, in their order; only where robots avoid each other"""
+    """Positions (x, y) of the robots below, in their order; empty if avoidance is off"""
     size: int
-    """How many values there are"""
+    """Number of values"""
 
     @classmethod
     def of(cls, plan: Plan, node: NodePlan) -> "GroupStateLayout":
-        """Returns the layout of a node."""
+        """Returns the layout of a node's GROUP_STATE."""
         below, own, root = node.robots - len(node.children), len(node.children) - 1, int(node.parent is None)
         if not plan.coupled:
             below = own = root = 0
@@ -54,34 +54,34 @@ class GroupStateLayout:
 
 
 class Carried(NamedTuple):
-    """A part of what a child says that becomes a part of its node's GROUP_STATE.
+    """A part of a child's message that a node copies into its GROUP_STATE.
 
-    A named tuple, for all of them are taken apart in every period."""
+    This is a named tuple because all of them are unpacked in every period."""
 
     child: int
     """Number of the child"""
     said: slice
-    """The part in the child's message"""
+    """Place in the child's message"""
     here: slice
-    """The part in the node's"""
+    """Place in the node's message"""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceLayout:
-    """REFERENCE of a node."""
+    """The layout of a node's REFERENCE."""
 
     accelerations: slice
     """Acceleration (x, y) of each child"""
     rates: slice
-    """Error rates (x, y) of all blocks of the plan; only where blocks are coupled"""
+    """Error rates (x, y) of all blocks of the plan; empty if no blocks are coupled"""
     forces: slice
-    """Avoidance force (x, y) on each robot below; only where robots avoid each other"""
+    """Avoidance force (x, y) on each robot below; empty if avoidance is off"""
     size: int
-    """How many values there are"""
+    """Number of values"""
 
     @classmethod
     def of(cls, plan: Plan, node: NodePlan) -> "ReferenceLayout":
-        """Returns the layout of what a node says to those of its children that are nodes."""
+        """Returns the layout of the REFERENCE that a node sends to its child nodes."""
         blocks = len(plan.robots) if plan.coupled else 0
         robots = node.robots if plan.avoidance.enabled else 0
         accelerations, rates, forces = _in_a_row(2 * len(node.children), 2 * blocks, 2 * robots)
@@ -90,18 +90,18 @@ class ReferenceLayout:
 
 @dataclass(frozen=True, slots=True)
 class ReferencePart:
-    """What a node finds for itself in its parent's REFERENCE."""
+    """The parts of a parent's REFERENCE that one child node uses."""
 
     acceleration: slice
-    """Of its centroid (x, y)"""
+    """Acceleration (x, y) of the child's centroid"""
     rates: slice
-    """Of all blocks of the plan"""
+    """Error rates of all blocks of the plan"""
     forces: slice
-    """On each robot below it"""
+    """Avoidance force (x, y) on each robot below the child"""
 
     @classmethod
     def of(cls, plan: Plan, parent: NodePlan, node: NodePlan) -> "ReferencePart":
-        """Returns the part of one of a parent's child nodes."""
+        """Returns the parts for the child `node` of `parent`."""
         whole = ReferenceLayout.of(plan, parent)
         forces = _pairs(whole.forces, node.first_robot - parent.first_robot, node.robots)
         return cls(acceleration_of(node), whole.rates, forces)
@@ -109,38 +109,38 @@ class ReferencePart:
 
 @dataclass(frozen=True, slots=True)
 class CommandLayout:
-    """COMMAND of a node."""
+    """The layout of a node's COMMAND."""
 
     accelerations: slice
     """Acceleration (x, y) of each child"""
     size: int
-    """How many values there are"""
+    """Number of values"""
 
     @classmethod
     def of(cls, node: NodePlan) -> "CommandLayout":
-        """Returns the layout of what a node says to those of its children that are robots."""
+        """Returns the layout of the COMMAND that a node sends to its robots."""
         (accelerations,) = _in_a_row(2 * len(node.children))
         return cls(accelerations, accelerations.stop)
 
 
 @dataclass(frozen=True, slots=True)
 class NodeLayout:
-    """All layouts that a node needs."""
+    """All layouts of the messages that a node sends and receives."""
 
     state: GroupStateLayout
-    """Of what it says to its parent"""
+    """Layout of the GROUP_STATE to its parent"""
     carried: tuple[Carried, ...]
-    """What it takes over into that from its children"""
+    """Parts of its children's messages that it copies into its GROUP_STATE"""
     mine: ReferencePart | None
-    """What it finds for itself in its parent's REFERENCE; None for the root"""
+    """The parts of its parent's REFERENCE that it uses; None for the root"""
     reference: ReferenceLayout | None
-    """Of what it says to its child nodes; None if it has none"""
+    """Layout of the REFERENCE to its child nodes; None if it has none"""
     command: CommandLayout | None
-    """Of what it says to its robots; None if it has none"""
+    """Layout of the COMMAND to its robots; None if it has none"""
 
     @classmethod
     def of(cls, plan: Plan, node: NodePlan) -> "NodeLayout":
-        """Returns the layouts of a node."""
+        """Returns all layouts of a node."""
         parent = None if node.parent is None else _node(plan, node.parent)
         kinds = {child >= len(plan.robots) for child in node.children}
         return cls(
@@ -153,18 +153,17 @@ class NodeLayout:
 
 
 def acceleration_of(child: RobotPlan | NodePlan) -> slice:
-    """Returns where a child finds its acceleration (x, y) in its parent's COMMAND or REFERENCE."""
+    """Returns the place of a child's acceleration (x, y) in its parent's COMMAND or REFERENCE."""
     return slice(2 * child.child_number, 2 * child.child_number + 2)
 
 
 def length(part: slice) -> int:
-    """Returns how many values a part has."""
+    """Returns the number of values of a part."""
     return int(part.stop - part.start)
 
 
 def says(plan: Plan, one: RobotPlan | NodePlan | BusRolePlan) -> dict[Channel, int | None]:
-    """Returns on which channels a role of a plan says something, and how many values its messages have; None if that varies
-    (frames)."""
+    """Returns the channels on which a role sends, with the number of values of the messages; None if it varies (frames)."""
     if isinstance(one, RobotPlan):
         state: dict[Channel, int | None] = {Channel.STATE: len(STATE_FIELDS)}
         return state | {Channel.TORQUE: len(TORQUE_FIELDS)} if plan.can.closed else state
@@ -181,9 +180,10 @@ def says(plan: Plan, one: RobotPlan | NodePlan | BusRolePlan) -> dict[Channel, i
 
 
 def said_by(plan: Plan) -> dict[tuple[int, Channel], int | None]:
-    """Returns all that may be said in a run: by source and channel the number of values, None if it varies.
+    """Returns the number of values of all messages of a run, by source and channel; None if it varies.
 
-    Where torque is mirrored, the bridge is no role of the plan: it says frames under the number after the last."""
+    Where torque is mirrored, the bridge is not a role of the plan.  It sends frames with the index after that of the last
+    node."""
     found = {(one.index, channel): size for one in plan.all_roles for channel, size in says(plan, one).items()}
     if not plan.can.closed:
         found[len(plan.formation), Channel.FRAMES] = None
@@ -191,15 +191,16 @@ def said_by(plan: Plan) -> dict[tuple[int, Channel], int | None]:
 
 
 def sized(plan: Plan) -> Plan:
-    """Returns a plan whose links say how many values their messages have."""
+    """Returns a plan in which each link has the number of values of its messages (`LinkPlan.size`)."""
     sizes = said_by(plan)
     return replace(plan, links=tuple(replace(link, size=sizes[link.source, link.channel]) for link in plan.links))
 
 
 def _carried(plan: Plan, node: NodePlan) -> Iterator[Carried]:
-    """Yields what a node takes over from its children: rates of the blocks below each, then the positions of its robots."""
+    """Yields the parts that a node copies from each child: the error rates of the blocks and the positions of the robots below
+    the child."""
     own = GroupStateLayout.of(plan, node)
-    blocks = robots = 0  # below the children before
+    blocks = robots = 0  # how many there are below the children before this one
     for number, (index, weight) in enumerate(zip(node.children, node.weights, strict=True)):
         theirs = None if index < len(plan.robots) else GroupStateLayout.of(plan, _node(plan, index))
         if plan.coupled and theirs is not None:
@@ -215,7 +216,7 @@ def _node(plan: Plan, index: int) -> NodePlan:
 
 
 def _in_a_row(*lengths: int) -> Iterator[slice]:
-    """Yields parts of these lengths, one behind the other."""
+    """Yields adjacent parts of these lengths, the first from 0 on."""
     start = 0
     for each in lengths:
         yield slice(start, start + each)
@@ -223,5 +224,5 @@ def _in_a_row(*lengths: int) -> Iterator[slice]:
 
 
 def _pairs(part: slice, first: int, count: int) -> slice:
-    """Returns `count` of the pairs (x, y) of a part, from number `first` on; nothing of an empty part."""
+    """Returns the place of `count` pairs (x, y) of a part, from pair number `first` on; an empty part stays empty."""
     return slice(part.start + 2 * first, part.start + 2 * (first + count)) if length(part) else part

@@ -1,9 +1,9 @@
-"""The plan: a scenario as the roles need it, with every default filled in, every wildcard resolved and every instant an
-integer of nanoseconds.  Plain frozen data: it is made once (`echelon.planning.plan_maker`) and handed to every
-process.  What concerns the CAN bus stands in `echelon.plan.can_plan`.
+"""The plan: a scenario as roles need it.  Every default is filled in, every wildcard is resolved, and instants are integers of
+nanoseconds.  A plan is frozen data, made once (`echelon.planning.plan_maker`) and given to every process.
+`echelon.plan.can_plan` has the part that concerns the CAN bus.
 
-Members are numbered: robots first, in the order of the tree, then nodes, children before parents; the root is last.
-Blocks of the transformed state (theory.md section 2) stand in the order of their nodes, then the centroid.
+Members have an index: first the robots in the order of the tree, then the nodes, children before parents; the root is last.
+The blocks of the transformed state (docs/architecture.md, 2.3) are in the order of their nodes; the centroid is last.
 """
 
 from dataclasses import dataclass, replace
@@ -22,12 +22,12 @@ COORDINATOR = "coordinator"
 
 
 class PlanError(UserError):
-    """A scenario whose values do not fit together; each line begins with the key."""
+    """The values of a scenario do not fit together.  Each line begins with the key."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotPlan:
-    """A robot: its place in the tree and its parameters (theory.md section 1), SI units."""
+    """A robot: its place in the tree, its parameters (docs/architecture.md, 2.1) in SI units, and its periods."""
 
     index: int
     path: str
@@ -52,7 +52,7 @@ class RobotPlan:
 
     @property
     def name(self) -> str:
-        """What people call it: its path."""
+        """Its name in texts: its path."""
         return self.path
 
     @property
@@ -63,7 +63,8 @@ class RobotPlan:
 
 @dataclass(frozen=True, slots=True)
 class ShapePlan:
-    """A node's desired shape: `points` are its children's positions, or the shape variables themselves [m]."""
+    """A node's desired shape.  With the kind `points`, `points` are positions of its children; with the kind `vectors`, they
+    are the shape variables [m]."""
 
     kind: str
     points: tuple[tuple[float, float], ...]
@@ -71,7 +72,9 @@ class ShapePlan:
 
 @dataclass(frozen=True, slots=True)
 class NodePlan:
-    """A node of the tree (group leader, or coordinator if it has no parent)."""
+    """A node of the tree: the leader of a group, or the coordinator, which has no parent.
+
+    `weights` are the numbers of robots below each child; `first_robot` is the index of the first robot below the node."""
 
     index: int
     path: str
@@ -86,12 +89,12 @@ class NodePlan:
 
     @property
     def name(self) -> str:
-        """What people call it: its path, or `coordinator`."""
+        """Its name in texts: its path, or `coordinator`."""
         return self.path or COORDINATOR
 
     @property
     def robots(self) -> int:
-        """How many robots stand below it."""
+        """The number of robots below it."""
         return sum(self.weights)
 
     @property
@@ -102,11 +105,11 @@ class NodePlan:
 
 @dataclass(frozen=True, slots=True)
 class BlockPlan:
-    """A block of the transformed state: the shape of one node (its `node`), or the centroid (`node` None).
+    """A block of the transformed state: the shape of the node with index `node`, or the centroid (`node` is None).
 
-    It takes `size` numbers (x and y of each variable) from `offset` on; `layer` is `intra`
-    (its children are robots), `middle`, `inter` (the root, over groups) or `centroid`.
-    `sigma` [s] is its time scale; `k1`, `k2` are the gains K_fb1, K_fb2 before division by σ² and σ, (size, size).
+    In the transformed state it has `size` numbers (x and y of each variable) from `offset` on.  `layer` is `intra`, `middle`,
+    `inter` or `centroid` (docs/architecture.md, 2.3).  `sigma` is its time scale σ [s].  `k1` and `k2` are the gains K_fb1 and
+    K_fb2 before division by σ² and σ, (size, size) (docs/architecture.md, 2.4).
     """
 
     name: str
@@ -121,7 +124,9 @@ class BlockPlan:
 
 @dataclass(frozen=True, slots=True)
 class AvoidancePlan:
-    """Collision avoidance: radii r_a < R_s [m], cap of one pair's force [m/s²]; `enabled` False only watches r_a."""
+    """Collision avoidance: the radii r_a < R_s [m] and the largest force of a pair [m/s²] (docs/architecture.md, 2.6).
+
+    If `enabled` is False, robots do not avoid each other, but violations of r_a are still counted."""
 
     enabled: bool
     avoidance_radius: float
@@ -131,7 +136,8 @@ class AvoidancePlan:
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """A directed link, applied where it ends: bounds of its delay [ns], i.i.d. loss, how long its messages may be held."""
+    """A directed link, applied at its receiver: bounds of its delay [ns], and the probability of loss, independent for each
+    message."""
 
     source: int
     receiver: int
@@ -141,22 +147,24 @@ class LinkPlan:
     delay_max_ns: int = 0
     loss: float = 0.0
     timeout_ns: int = NEVER_NS
-    """Age beyond which a message is not used any more (policy `hold_then_stop`); with policy `hold`: never"""
+    """Age above which a message is not used any more (policy `hold_then_stop`); `NEVER_NS` with the policy `hold`"""
     first_ns: int = 0
-    """Instant of message number 0: before the run begins where drives are brought up"""
+    """Run time of message number 0; negative between bridge and drives, which bring the drives up before run time 0"""
     size: int | None = None
-    """How many values a message has that says something (echelon.plan.layout); None: any number"""
+    """Number of values of a message that is not null (echelon.plan.layout); None: any number"""
 
     @property
     def ideal(self) -> bool:
-        """True if every message is usable in the tick it was sent in."""
+        """True if the link has no delay and no loss: a message is in use from the instant at which it is sent."""
         return self.delay_max_ns == 0 and self.loss == 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClaimPlan:
-    """What the run is expected to show: from `settled_by` [s] on, every block of `block` (a name or a layer) stays within
-    `band` of the error that it starts with, to the end and for `dwell` time scales at least (None: as `HealthPlan` says)."""
+    """A claim about the errors of the blocks that `block` (a name or a layer) stands for.
+
+    From `settled_by` [s] to the end of the run, each error stays within the fraction `band` of the error at the start.  This
+    lasts for at least `dwell` time scales of the block; None: `HealthPlan.dwell`."""
 
     block: str
     settled_by: float
@@ -166,27 +174,27 @@ class ClaimPlan:
 
 @dataclass(frozen=True, slots=True)
 class HealthPlan:
-    """What every run is checked for, whatever it claims (docs/architecture.md, 6.5)."""
+    """Limits of the checks that are made of every run, whatever it claims (docs/architecture.md, 6.5)."""
 
     off: frozenset[str]
     """Names of checks that are left out"""
     dwell: float | None
-    """How long an error must stay in its band until the end to be settled, in time scales of its block; None: 3/√k1"""
+    """How long an error must stay in its band before the end to be settled, in time scales of its block; None: 3/√k1"""
     floor: float
-    """Errors up to this are not judged [m]"""
+    """Errors up to this size are not judged [m]"""
     growth: float
     """Largest ratio of an error in the last sixth of the run to that in the sixth before"""
     saturation: float
     """Largest share of the time in which a robot's limits act"""
     silence: float
-    """Longest time in which a robot says nothing [s]"""
+    """Longest time in which a robot sends nothing [s]"""
     late: float
     """Largest share of late stages"""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A whole run."""
+    """The plan of a whole run."""
 
     name: str
     seed: int
@@ -198,11 +206,11 @@ class Plan:
     law: Part[Any]
     """A controller.laws.Law"""
     coupling: Array
-    """K̄ of all blocks, (2N, 2N), zero on the diagonal blocks."""
+    """The coupling K̄ of all blocks, (2N, 2N) for N robots; a block is not coupled to itself"""
     lead: float
-    """How far ahead the law looks, in periods of its node (controller.laws.linear)."""
+    """λ, how far ahead the law looks, in acceleration periods of the node (docs/architecture.md, 2.5)"""
     trajectory: Part[Any]
-    """Of the centroid: a controller.trajectory.Trajectory"""
+    """The desired trajectory of the centroid, a controller.trajectory.Trajectory"""
     avoidance: AvoidancePlan
     links: tuple[LinkPlan, ...]
     can: CanPlan
@@ -210,8 +218,8 @@ class Plan:
     health: HealthPlan
     events: tuple[EventPlan, ...] = ()
     bus_roles: tuple[BusRolePlan, ...] = ()
-    """The bridge, then the virtual drives if there are any, where the torque path is closed (`can.closed`); otherwise
-    empty.  They are numbered after the nodes."""
+    """On the closed torque path (`can.closed`) the bridge, then the virtual drives if there are any; otherwise empty.  Their
+    indices come after those of the nodes"""
 
     @property
     def root(self) -> NodePlan:
@@ -220,40 +228,42 @@ class Plan:
 
     @property
     def coupled(self) -> bool:
-        """True if some block acts on another, so that error rates must travel."""
+        """True if a block is coupled to another block, so that messages must carry error rates."""
         return bool(self.coupling.any())
 
     @property
     def formation(self) -> tuple[RobotPlan | NodePlan, ...]:
-        """Robots and nodes by index."""
+        """Robots and nodes, in the order of their indices."""
         return (*self.robots, *self.nodes)
 
     @property
     def all_roles(self) -> tuple[RobotPlan | NodePlan | BusRolePlan, ...]:
-        """Robots, nodes, and bridge and drives where the torque path is closed, by index."""
+        """Robots and nodes, and on the closed torque path bridge and virtual drives, in the order of their indices."""
         return (*self.robots, *self.nodes, *self.bus_roles)
 
     @property
     def bridge(self) -> BusRolePlan | None:
-        """The bridge's role; None where the torque path is not closed."""
+        """The bridge; None if the torque path is not closed."""
         return self.bus_roles[0] if self.bus_roles else None
 
     @property
     def drives(self) -> BusRolePlan | None:
-        """The virtual drives' role; None where the drives are real, or the torque path is not closed."""
+        """The virtual drives; None if the drives are real, or if the torque path is not closed."""
         return self.bus_roles[1] if len(self.bus_roles) > 1 else None
 
     def links_into(self, receiver: int) -> tuple[LinkPlan, ...]:
-        """The links that end at a member."""
+        """Returns the links that end at a member."""
         return tuple(link for link in self.links if link.receiver == receiver)
 
     def block_of(self, node: int) -> BlockPlan:
-        """The shape block of a node."""
+        """Returns the block of a node's shape."""
         return next(block for block in self.blocks if block.node == node)
 
 
 def on_wall_clock(plan: Plan) -> Plan:
-    """Returns the plan as those have it who are on a bus on a wall clock: the bus takes its own time unless it is paced."""
+    """Returns the plan for roles that use a bus on a wall clock.
+
+    If the bus is not paced, it takes its own time: `timing` becomes `ideal`, and events that disturb a bus are removed."""
     if plan.can.paced:
         return plan
     events = tuple(event for event in plan.events if event.kind not in DISTURBANCES)

@@ -1,4 +1,4 @@
-"""The blocks of a plan: their time scales, gains and coupling (theory.md section 3), from the rules of `[law]`."""
+"""The blocks of a plan: their time scales, gains and coupling from the table `[law]` (docs/architecture.md, 2.4)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +13,9 @@ from echelon.scenario.values import Matrix
 
 
 def make_blocks(law: Law, nodes: Sequence[NodePlan]) -> tuple[BlockPlan, ...]:
-    """Returns the blocks, node by node and the centroid last, with their time scales and gains.  Raises PlanError."""
+    """Returns the blocks with their time scales and gains: one for each node in their order, then the centroid's.
+
+    Raises PlanError if numbers do not fit the tree, or a gain over σ² is not finite."""
     blocks: list[BlockPlan] = []
     offset = 0
     for node, sigma in zip(nodes, _time_scales(law, nodes), strict=True):
@@ -44,7 +46,10 @@ def make_blocks(law: Law, nodes: Sequence[NodePlan]) -> tuple[BlockPlan, ...]:
 
 
 def _time_scales(law: Law, nodes: Sequence[NodePlan]) -> list[float]:
-    """Returns σ of each node's shape: ε1 for the root, and one more factor for each layer, or for each group, below."""
+    """Returns the time scale σ of each node's shape [s] (docs/architecture.md, 2.4): the product of the first few epsilons.
+
+    With `three`, a node at depth k has k + 1 factors.  With `multi`, the root has one factor, and each node one more than the
+    node after it.  Raises PlanError if the scenario gives another number of epsilons."""
     if law.time_scales == "three":
         needed, what = max(node.depth for node in nodes) + 1, "layers of the tree"
         factors = [node.depth + 1 for node in nodes]
@@ -60,13 +65,13 @@ def _time_scales(law: Law, nodes: Sequence[NodePlan]) -> list[float]:
 
 
 def _epsilon(law: Law) -> str:
-    """Returns how a mistake in `law.epsilon` begins: with its value, and whether anybody wrote it."""
+    """Returns the beginning of an error about `law.epsilon`: its value, and a remark if the scenario does not give it."""
     default = "" if "epsilon" in law.model_fields_set else ", its default (the scenario gives none)"
     return f"law.epsilon = {law.epsilon}{default}"
 
 
 def make_coupling(law: Law, blocks: Sequence[BlockPlan]) -> Array:
-    """Returns K̄ of all blocks.  Raises PlanError."""
+    """Returns the coupling K̄ of all blocks, (2N, 2N) for N robots.  Raises PlanError if a rule does not fit the blocks."""
     size = blocks[-1].offset + blocks[-1].size
     coupling = np.zeros((size, size))
     mistakes = Mistakes()
@@ -78,7 +83,7 @@ def make_coupling(law: Law, blocks: Sequence[BlockPlan]) -> Array:
 
 
 def _couple(coupling: Array, rule: Coupling, blocks: Sequence[BlockPlan], key: str) -> None:
-    """Enters a rule into K̄."""
+    """Writes the values of one rule into K̄ (`coupling`).  Raises PlanError."""
     pairs = [
         (block, onto)
         for block in fitting(blocks, rule.block, f"{key}.block")
@@ -98,7 +103,7 @@ def _couple(coupling: Array, rule: Coupling, blocks: Sequence[BlockPlan], key: s
 
 
 def fitting(blocks: Sequence[BlockPlan], name: str, key: str) -> list[BlockPlan]:
-    """Returns the blocks that a name stands for: a block's own, a layer's, or `*`.  Raises PlanError if none."""
+    """Returns the blocks that a name stands for: the name of a block, of a layer, or `*`.  Raises PlanError if none fits."""
     fits = [block for block in blocks if name in ("*", block.name, block.layer)]
     if not fits:
         groups = [block.name for block in blocks if block.name not in BLOCK_NAMES]
@@ -108,16 +113,19 @@ def fitting(blocks: Sequence[BlockPlan], name: str, key: str) -> list[BlockPlan]
 
 
 def _range(block: BlockPlan) -> slice:
+    """Returns the place of a block in the transformed state."""
     return slice(block.offset, block.offset + block.size)
 
 
 def _gain(value: float | Matrix, key: str, block: BlockPlan) -> Array:
+    """Returns a gain as a matrix; a number stands for a multiple of the identity."""
     if isinstance(value, list):
         return _matrix(value, (block.size, block.size), key, block.name)
     return value * np.eye(block.size)
 
 
 def _matrix(rows: Matrix, shape: tuple[int, int], key: str, what: str) -> Array:
+    """Returns rows of numbers as an array.  Raises PlanError if they do not have this shape."""
     if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
         raise PlanError(f"{key}: a matrix for {what} must have {shape[0]} rows of {shape[1]} numbers")
     return np.array(rows, dtype=float).reshape(shape)

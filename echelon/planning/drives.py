@@ -1,6 +1,6 @@
-"""What a plan says of drives: from the scenario's tables to drives, envelopes, buses, and events, all checked.
+"""From the tables of a scenario to the plan's drives, envelopes, buses and events, with all checks.
 
-Raises PlanError with the key, the value and what is allowed.
+All functions raise PlanError with the key, the value and what is allowed.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,7 +16,7 @@ from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, Env
 from echelon.scenario.values import path_matches
 
 RAW_MAX: Final = 32767
-"""Largest whole number in a frame with torques."""
+"""Largest torque in a frame that holds torques as whole numbers of 16 bits."""
 MOTOR_DEFAULTS: Final[dict[str, Any]] = {
     "torque_slew": inf,
     "lag": 0.0,
@@ -34,13 +34,13 @@ MOTOR_DEFAULTS: Final[dict[str, Any]] = {
     "inertia": 0.01,
     "friction": 0.01,
 }
-"""A motor that does at once what it is told, and never gets warm."""
+"""An ideal motor: its torque follows at once, and it never gets warm."""
 FIRST_BUS: Final = "can0"
-"""The name of the bus where a scenario names none; and what it is called in can.log."""
+"""Name of the bus, also in can.log, if the scenario names none"""
 
 
 def make_can(can: Can, cycle_ns: int) -> CanPlan:
-    """Returns the plan of the buses; `cycle_ns` is the period of torque frames."""
+    """Returns the plan of the buses; `cycle_ns` is the period of torque frames [ns].  Raises PlanError."""
     buses = [BusPlan(name, bus.url or can.url, bus.bitrate or can.bitrate) for name, bus in can.buses.items()] or [
         BusPlan(FIRST_BUS, can.url, can.bitrate)
     ]
@@ -73,9 +73,9 @@ def make_can(can: Can, cycle_ns: int) -> CanPlan:
 
 
 class DriveMaker:
-    """Makes the drives of robots, one robot after the other, and when all are there, gives them their node ids.
+    """Makes the drives of all robots: first `drive` for each robot, then `placed`, which chooses the node ids.
 
-    `default` is the protocol where a scenario names none."""
+    `default` is the protocol of drives for which the scenario names none."""
 
     def __init__(self, can: Can, plan: CanPlan, default: Part[Any]) -> None:
         self._can, self._plan, self._default = can, plan, default
@@ -84,7 +84,9 @@ class DriveMaker:
     def drive(
         self, table: DriveTable, values: dict[str, Any], key: str, robot: int, path: str, period_ns: int
     ) -> DrivePlan:
-        """Returns the drives of a robot with these (inherited) values, not placed yet; takes `bus` out of them."""
+        """Returns the drives of a robot, still without their node ids.
+
+        `values` are the robot's values, inherited ones included; `bus` is removed from them.  Raises PlanError."""
         bus, protocol = self._bus(values.pop("bus", None), key), table.protocol or self._default
         self._places.append(Place(f"{key}.drive", path, robot, bus, protocol, table.node_ids))
         given = table.model_dump(exclude_none=True, exclude={"protocol", "node_ids", "recover_after"})
@@ -110,12 +112,14 @@ class DriveMaker:
         )
 
     def placed(self, robots: Sequence[RobotPlan]) -> tuple[RobotPlan, ...]:
-        """Returns all robots whose drives were made, with their node ids."""
+        """Returns the robots with the node ids of their drives.  Raises PlanError if there are not enough free ones."""
         nodes = choose_nodes(self._places)
         return tuple(replace(robot, drive=replace(robot.drive, node_ids=nodes[robot.index])) for robot in robots)
 
     def envelope(self, values: dict[str, Any]) -> EnvelopePlan:
-        """Returns the envelope of a robot with these (inherited) values; takes `envelope` out of them."""
+        """Returns the envelope of a robot.
+
+        `values` are the robot's values, inherited ones included; `envelope` is removed from them."""
         table = EnvelopeTable(**values.pop("envelope", None) or {})
         return EnvelopePlan(
             torque_limit=values["torque_limit"] if table.torque_limit is None else table.torque_limit,
@@ -126,6 +130,7 @@ class DriveMaker:
         )
 
     def _bus(self, name: str | None, key: str) -> int:
+        """Returns the number of a robot's bus, the first one if it names none.  Raises PlanError."""
         names = [bus.name for bus in self._plan.buses]
         if name is None:
             return 0
@@ -135,7 +140,7 @@ class DriveMaker:
 
 
 def make_events(events: Iterable[Event], robots: Sequence[RobotPlan], can: CanPlan) -> tuple[EventPlan, ...]:
-    """Returns the events in the order of their times."""
+    """Returns the events in the order of their instants.  Raises PlanError."""
     plans = []
     for number, event in enumerate(events):
         key = f"events.{number}"
@@ -163,6 +168,7 @@ def make_events(events: Iterable[Event], robots: Sequence[RobotPlan], can: CanPl
 
 
 def _robots(pattern: str, robots: Sequence[RobotPlan], key: str) -> tuple[int, ...]:
+    """Returns the indices of the robots whose paths fit a pattern.  Raises PlanError if there are none."""
     found = tuple(robot.index for robot in robots if path_matches(pattern, robot.path))
     if not found:
         raise PlanError(f"{key}.robot = {pattern!r}: fits no robot")
@@ -170,6 +176,7 @@ def _robots(pattern: str, robots: Sequence[RobotPlan], key: str) -> tuple[int, .
 
 
 def _buses(name: str | None, can: CanPlan, key: str) -> tuple[int, ...]:
+    """Returns the number of the bus with a name, or the numbers of all buses.  Raises PlanError."""
     names = [bus.name for bus in can.buses]
     if name is None:
         return tuple(range(len(names)))

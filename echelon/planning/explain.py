@@ -1,4 +1,4 @@
-"""Explains what pydantic found wrong with a scenario, in the words of the file: its key, its value, what is allowed."""
+"""Turns pydantic's errors about a scenario into lines for the user: the key, the value and what is allowed."""
 
 import json
 import re
@@ -36,7 +36,7 @@ TEXTS: Final = {
     "model_attributes_type": "must be a table",
     "missing": "missing",
 }
-"""What is said of pydantic's types of errors; those that need more than their context are in `_text`."""
+"""Texts for pydantic's types of errors.  `_text` makes the texts that need more than the error's context."""
 
 NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits, hyphens or underscores"
 PAIR_RULE: Final = "must be two numbers, [x, y]"
@@ -44,27 +44,29 @@ PAIR_RULE: Final = "must be two numbers, [x, y]"
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """What is wrong: the keys that lead to the place, and the line that says so."""
+    """A mistake in a scenario: the keys that lead to it, and the line for the user."""
 
     keys: tuple[str | int, ...]
     text: str
 
 
 def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[str | int, ...] = ()) -> list[Mistake]:
-    """Returns the mistakes, each once.  Of a key that is missing and an unknown one that it is meant to be, the latter.
+    """Returns the mistakes, each once.
 
-    `root` is the model that was validated, `above` are the keys that lead to it in the file."""
-    meant = {
+    If a key is missing and an unknown key resembles it, only the unknown key is reported, since it is probably misspelled.
+    `root` is the model that was validated; `above` are the keys that lead to it in the file."""
+    misspelled = {
         (error["loc"][:-1], close)
         for error in errors
         if error["type"] == "extra_forbidden"
         and (close := _close_key(str(error["loc"][-1]), _walk(error["loc"], root)[1]))
     }
-    told = [e for e in errors if e["type"] != "missing" or (e["loc"][:-1], e["loc"][-1]) not in meant]
-    return list(dict.fromkeys(mistake for error in told for mistake in _mistakes(error, root, above)))
+    reported = [e for e in errors if e["type"] != "missing" or (e["loc"][:-1], e["loc"][-1]) not in misspelled]
+    return list(dict.fromkeys(mistake for error in reported for mistake in _mistakes(error, root, above)))
 
 
 def _mistakes(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int, ...]) -> list[Mistake]:
+    """Returns the mistakes of one error: several if it is a part with several wrong parameters."""
     if error["type"] != "value_error" or not isinstance(part := error["ctx"]["error"], PartError):
         return [_mistake(error, root, above)]
     keys = above + _walk(error["loc"], root)[0] + part.keys
@@ -75,22 +77,23 @@ def _mistakes(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int
 
 
 def _mistake(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int, ...]) -> Mistake:
+    """Returns the mistake of one error that does not come from a part."""
     kind, value, location = error["type"], error["input"], error["loc"]
     if kind.startswith("recursion"):
         return Mistake(("formation",), "formation: groups are nested too deep")
-    if kind.startswith("string") and location[-1] == "[key]":  # not a value is wrong, but the key before it
+    if kind.startswith("string") and location[-1] == "[key]":  # the key is wrong, not its value
         keys = above + _walk(location[:-1], root)[0]
         return Mistake(keys, f"{key_text(keys)}: {NAME_RULE}")
     keys, annotation = _walk(location, root)
     keys = above + keys
     if kind == "extra_forbidden":
         return Mistake(keys, f"{key_text(keys)}: {_unknown(str(keys[-1]), annotation)}")
-    if kind in ("union_tag_invalid", "union_tag_not_found"):  # of a table that says its `kind`
+    if kind in ("union_tag_invalid", "union_tag_not_found"):  # a table whose `kind` is wrong or missing
         keys, kinds = (*keys, "kind"), list(_members(annotation))
         if kind == "union_tag_not_found":
             return Mistake(keys, f"{key_text(keys)}: missing; {_one_of(kinds)}")
         return Mistake(keys, f"{key_text(keys)} = {value_text(value['kind'])}: {_one_of(kinds, value['kind'])}")
-    if kind == "missing" and isinstance(keys[-1], int):  # half of a pair: the pair is what is wrong
+    if kind == "missing" and isinstance(keys[-1], int):  # a pair with one number: report the pair
         keys, kind = keys[:-1], "tuple_type"
     text = PAIR_RULE if kind == "tuple_type" else _text(error, annotation)
     shown = "" if kind in ("missing", "value_error") else f" = {value_text(value)}"
@@ -98,7 +101,7 @@ def _mistake(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int,
 
 
 def _text(error: ErrorDetails, annotation: Any) -> str:
-    """Returns what is allowed where an error is."""
+    """Returns the text that says what is allowed in the place of an error."""
     kind, value = error["type"], error["input"]
     if kind == "value_error":
         return str(error["ctx"]["error"])
@@ -137,16 +140,16 @@ def _unknown(key: str, model: Any) -> str:
 
 
 def _close_key(key: str, model: Any) -> str | None:
-    """Returns the key of a table that an unknown one is probably meant to be."""
+    """Returns the key of a table that most resembles an unknown key, or None."""
     close = get_close_matches(key, sorted(_bare(model).model_fields), n=1, cutoff=0.5)
     return close[0] if close else None
 
 
 def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ...], Any]:
-    """Follows a location of pydantic's through the types of a model.
+    """Follows a location of a pydantic error through the types of a model.
 
-    Returns the parts of it that are keys of the file, for some only name the member of a union; and the type it leads
-    to.  A location that ends with an unknown key leads to the type of its table.
+    Returns the parts of the location that are keys of the file (other parts name members of unions), and the type to which
+    the location leads.  A location that ends with an unknown key leads to the type of the table with that key.
     """
     keys: list[str | int] = []
     annotation: Any = root
@@ -155,19 +158,19 @@ def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ..
             member = members[str(part)]
             if at < len(location) or _is_model(member):
                 annotation = member
-            continue  # a plain value that is no member of the union is explained as such
+            continue  # a plain value: the type stays the union, so that all its members are offered
         keys.append(part)
         bare = _bare(annotation)
         if _is_model(bare):
             if str(part) in bare.model_fields:
                 annotation = bare.model_fields[str(part)].annotation
-        else:  # a list, a pair, or a table of tables: what it holds comes last
+        else:  # a list, a pair, or a table of tables: its last type argument is the type of its entries
             annotation = get_args(bare)[-1]
     return tuple(keys), annotation
 
 
 def is_array(keys: Sequence[str], root: type[BaseModel]) -> bool:
-    """True if an array of tables stands at a path of keys of a model, numbers of entries among them."""
+    """True if a path of keys, which may hold numbers of entries, leads to an array of tables in a model."""
     annotation: Any = root
     for key in keys:
         bare = _bare(annotation)
@@ -187,7 +190,7 @@ def _is_model(annotation: Any) -> bool:
 
 
 def _bare(annotation: Any) -> Any:
-    """Returns a type without its metadata, and without None."""
+    """Returns a type without its metadata (Annotated) and without None."""
     while get_origin(annotation) is Annotated or (_is_union(annotation) and len(_choices(annotation)) == 1):
         annotation = get_args(annotation)[0] if get_origin(annotation) is Annotated else _choices(annotation)[0]
     return annotation
@@ -202,7 +205,7 @@ def _choices(annotation: Any) -> list[Any]:
 
 
 def _members(annotation: Any) -> dict[str, Any]:
-    """Returns the members of a union by the tags that name them in pydantic's locations; empty if it is none."""
+    """Returns the members of a union by their tags in pydantic's locations; empty if the type is not a union."""
     bare = _bare(annotation)
     return {_tag(member): member for member in _choices(bare)} if _is_union(bare) else {}
 
@@ -216,12 +219,12 @@ def _tag(member: Any) -> str:
 
 
 def key_text(keys: Sequence[str | int]) -> str:
-    """Returns a path of keys as `--set` takes it: `links.0.delay`; what TOML would quote is quoted."""
+    """Returns a path of keys as `--set` takes it: `links.0.delay`.  Keys that TOML would quote are quoted."""
     return ".".join(str(key) if re.fullmatch(r"[A-Za-z0-9_-]+", str(key)) else short(json.dumps(key)) for key in keys)
 
 
 def value_text(value: Any) -> str:
-    """Returns a value as TOML writes it, or nearly, on at most 60 characters."""
+    """Returns a value nearly as TOML writes it, in at most 60 characters."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, list):
@@ -234,5 +237,5 @@ def value_text(value: Any) -> str:
 
 
 def short(text: str) -> str:
-    """Returns a text on at most 60 characters."""
+    """Returns a text cut to at most 60 characters."""
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,4 +1,5 @@
-"""Reading a scenario: TOML, overrides, and mistakes explained, a line each (file, key, value, what is allowed)."""
+"""Reads a scenario: parses TOML, applies overrides, makes the plan, and reports each mistake in one line (file, key, value,
+what is allowed)."""
 
 import re
 import tomllib
@@ -19,13 +20,13 @@ from echelon.scenario.tables import Scenario
 
 
 class ScenarioError(UserError):
-    """Mistakes in a scenario or its overrides, a line each; the first begins with the file."""
+    """Mistakes in a scenario or in its overrides, one line each.  The first line begins with the name of the file."""
 
 
 def load(path: Path, overrides: Sequence[str], registry: Registry) -> tuple[Scenario, Plan]:
-    """Reads a scenario file, applies overrides `key=value`, and makes its plan.  Raises ScenarioError.
+    """Reads a scenario file, applies overrides `key=value`, and returns the scenario and its plan.  Raises ScenarioError.
 
-    The scenario's parts come from `registry`; `echelon.sim.parts.loading.load` has one."""
+    `registry` has the parts that a scenario may name; `echelon.sim.parts.loading.load` calls this with the usual one."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -38,8 +39,9 @@ def load(path: Path, overrides: Sequence[str], registry: Registry) -> tuple[Scen
 
 
 def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, folder: Path) -> tuple[Scenario, Plan]:
-    """Makes a scenario and its plan of TOML text; `name` stands for the file in messages, parts in files are looked for in
-    `folder`.  Raises ScenarioError."""
+    """Returns the scenario and the plan of a TOML text.  Raises ScenarioError.
+
+    Errors call the file `name`.  Files of parts are relative to `folder`."""
     table = _table(text, name)
     if not table and not overrides:
         needed = [key for key, field in Scenario.model_fields.items() if field.is_required()]
@@ -67,29 +69,31 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
 
 
 def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioError:
-    """Returns the error that tells mistakes: each with the override it comes from, or an empty string."""
+    """Returns the error for a list of mistakes: pairs of the override that causes the mistake (or an empty string) and its
+    text."""
     (where, text), *others = dict.fromkeys(mistakes)
     first = f"{name} {where}: {text}" if where else f"{name}: {text}"
     return ScenarioError(first, *(f"{where}: {text}" if where else text for where, text in others))
 
 
 def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None) -> str:
-    """Returns the scenario as TOML with all defaults written out; reading it again gives the same scenario.
+    """Returns the scenario as TOML with all defaults written out.  Reading it again gives the same scenario.
 
-    `names` are other names for files of parts."""
-    import tomlkit  # which takes long, and is needed by those who write alone
+    `names` gives new names to files of parts."""
+    import tomlkit  # imported here because it takes long and only few commands write a scenario
 
     return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True, context=names))
 
 
 def _table(text: str, name: str) -> dict[str, Any]:
+    """Returns TOML text as a table.  Raises ScenarioError."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{name}: not TOML: {error}") from None
     except RecursionError:
         raise ScenarioError(f"{name}: not TOML that can be read: nested too deep") from None
-    except ValueError:  # Python's limit to the digits of an integer
+    except ValueError:  # Python limits the number of digits of an integer
         raise ScenarioError(f"{name}: an integer has too many digits") from None
 
 
@@ -98,13 +102,14 @@ class OverrideError(ValueError):
 
 
 _INDEX = re.compile(r"\s*\[\s*([0-9]{1,9})\s*\](?=\s*(?:[.\[]|$))")
-"""The number of an entry in brackets, at the end of a chunk"""
+"""The number of an array's entry in brackets, at the end of a chunk of a key"""
 
 
 def _override(table: dict[str, Any], override: str) -> str:
-    """Sets one value, as in `law.epsilon=[0.1, 0.2]`, `links.0.delay=0.006` or `links[0].delay=0.006`; returns its key.
+    """Sets one value in a table and returns its key.  Raises OverrideError.
 
-    Where an array holds one table alone, its number may be left out: `links.delay=0.006`."""
+    An override reads `law.epsilon=[0.1, 0.2]`, `links.0.delay=0.006` or `links[0].delay=0.006`.  The number may be left out
+    if the array holds only one table: `links.delay=0.006`."""
     key, equals, text = override.partition("=")
     chunks = [chunk.strip() for chunk in _INDEX.sub(r".\1", key).split(".")]
     if not equals or not all(chunks):
@@ -133,7 +138,8 @@ def _override(table: dict[str, Any], override: str) -> str:
 
 
 def _numbered(table: dict[str, Any], chunks: Sequence[str]) -> list[str]:
-    """Returns a path of keys with the numbers that were left out of it.  Raises OverrideError where it is not clear which."""
+    """Returns a path of keys with the numbers that were left out.  Raises OverrideError if an array does not have just one
+    table."""
     path: list[str] = []
     at: Any = table
     for chunk in chunks:
@@ -164,14 +170,15 @@ def _is_number(chunk: str) -> bool:
 
 
 def _index(array: list[Any], chunk: str) -> int:
-    """Returns the index that a chunk names: of an entry, or of the one that would come next."""
+    """Returns the index that a chunk of a key stands for: of an entry, or of the next entry to be added.  Raises
+    OverrideError."""
     if not _is_number(chunk) or int(chunk) > len(array):
         raise OverrideError(f"{short(chunk)} must be a number from 0 to {len(array)}, for an entry or the next one")
     return int(chunk)
 
 
 def _value(text: str) -> Any:
-    """Returns the value that a text stands for: TOML, or else the text itself, so that strings need no quotes."""
+    """Returns the value of a text in TOML.  A text that is not TOML is returned as a string, so that strings need no quotes."""
     try:
         table = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
@@ -180,7 +187,7 @@ def _value(text: str) -> Any:
 
 
 def _overridden(key: str, changed: dict[str, str]) -> str:
-    """Returns `with --set …` if what stands at a key comes from an override, or holds something that does."""
+    """Returns `with --set …` if the value of a key, or a value within it, comes from an override; otherwise an empty string."""
     for path, override in reversed(changed.items()):
         if f"{key}.".startswith(f"{path}.") or f"{path}.".startswith(f"{key}."):
             return f"with --set {short(override)}"

@@ -1,4 +1,4 @@
-"""The members of a plan: walks the scenario's tree, hands down what robots inherit, and numbers robots and nodes."""
+"""The members of a plan: walks the scenario's tree, gives robots their inherited values, and numbers robots and nodes."""
 
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -24,23 +24,23 @@ ROBOT_DEFAULTS: Final[dict[str, Any]] = {
 }
 DEFAULT_PLANT: Final = "paper"
 NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
-"""What must be said of every robot, on some level."""
+"""Keys that must be given for every robot, on some level."""
 MAX_ROBOTS: Final = 127
-"""As many as a bus has identifiers for where each robot has three of its own."""
+"""Largest number of robots: a bus has identifiers for no more if each robot has three of its own."""
 MAX_NS: Final = 2**62
-"""146 years: sums of two instants still fit the message header."""
+"""Upper bound of durations [ns], 146 years: the sum of two of them still fits the message header."""
 
 
 def nanoseconds(seconds: float, key: str) -> int:
-    """Returns a duration in nanoseconds.  Raises PlanError unless that is a whole number, rounding of sums aside."""
-    exact = Decimal(repr(seconds)) * 10**9  # of the digits as written: a float of many seconds lacks some
+    """Returns a duration in nanoseconds.  Raises PlanError if that is not a whole number, up to rounding errors of sums."""
+    exact = Decimal(repr(seconds)) * 10**9  # from the written digits: a product of floats would lose some
     if not 1 <= exact < MAX_NS or abs(exact - round(exact)) > Decimal("1e-3"):
         raise PlanError(f"{key} = {seconds}: must be a whole number of nanoseconds, at least 1 and less than {MAX_NS}")
     return round(exact)
 
 
 def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...], CanPlan]:
-    """Returns robots and nodes by their numbers, and the buses that the robots' drives are on.  Raises PlanError."""
+    """Returns the robots and the nodes in the order of their indices, and the plan of the buses.  Raises PlanError."""
     count = _count_robots(scenario.formation)
     if count > MAX_ROBOTS:
         raise PlanError(f"formation: {count} robots, but a bus has identifiers for {MAX_ROBOTS}")
@@ -60,34 +60,41 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
 
 
 def robot_key(path: str) -> str:
-    """Returns the key of a robot in the scenario: `formation.groups.g1.robots.r2` of `g1/r2`."""
+    """Returns the key of a robot in the scenario: `formation.groups.g1.robots.r2` for the path `g1/r2`."""
     *groups, robot = path.split("/")
     return ".".join(["formation", *(f"groups.{group}" for group in groups), "robots", robot])
 
 
 def _count_robots(group: Group) -> int:
+    """Returns the number of robots below a group."""
     return len(group.robots) + sum(_count_robots(sub) for sub in group.groups.values())
 
 
 def _count_nodes(group: Group) -> int:
+    """Returns the number of nodes of a group's subtree, the group included."""
     return 1 + sum(_count_nodes(sub) for sub in group.groups.values())
 
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where a member stands: its key in the scenario, its path in the tree, its parent, which child of it, how deep."""
+    """The place of a member in the tree."""
 
     key: str
+    """Its key in the scenario"""
     path: str
+    """Its path in the tree"""
     parent: int | None
+    """Index of its parent node; None for the root"""
     child_number: int
+    """Its number among the children of its parent"""
     depth: int
+    """Its depth in the tree; the root has depth 0"""
 
 
 class _Walk:
-    """One walk through the tree; robots are numbered when they are met, nodes after all that is below them.
+    """One walk through the tree.  A robot gets its index when the walk meets it, a node after everything below it.
 
-    Mistakes are noted on the way; what was made is worth nothing until `check` has said that there are none."""
+    Mistakes are collected on the way.  The robots and nodes are valid only if `check` does not raise."""
 
     def __init__(
         self,
@@ -101,19 +108,19 @@ class _Walk:
         self._acceleration_ns, self._torque_ns, self._first_node = acceleration_ns, torque_ns, first_node
         self.drives, self._closed, self._default_plant = drives, closed, default_plant
         self._mistakes = Mistakes()
-        self._of_robots: dict[str, list[str]] = {}  # what is wrong, behind the robot's key: the keys of those robots
+        self._robot_mistakes: dict[str, list[str]] = {}  # text of a mistake after the robot's key: keys of the robots
         self.robots: list[RobotPlan] = []
         self.nodes: list[NodePlan] = []
 
     def check(self) -> None:
-        """Raises PlanError if there were mistakes.  What many robots inherit is told of the first one."""
-        for text, keys in self._of_robots.items():
+        """Raises PlanError if there were mistakes.  A mistake that several robots share is reported for the first of them."""
+        for text, keys in self._robot_mistakes.items():
             same = f"; the same holds for {len(keys) - 1} more" if len(keys) > 1 else ""
             self._mistakes.lines.append(f"{keys[0]}{text}{same}")
         self._mistakes.check(PlanError)
 
     def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
-        """Adds a group and all below it; returns its node."""
+        """Adds a group and everything below it; returns its node.  `inherited` are the values of the groups around it."""
         index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
         first_robot = len(self.robots)
         inherited = _overlaid(inherited, group.robot)
@@ -137,7 +144,7 @@ class _Walk:
                 self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
             except PlanError as error:
                 for line in error.lines:
-                    self._of_robots.setdefault(line.removeprefix(at.key), []).append(at.key)
+                    self._robot_mistakes.setdefault(line.removeprefix(at.key), []).append(at.key)
         for name, sub in group.groups.items():
             at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
             child = self.add_group(sub, at, inherited)
@@ -168,6 +175,7 @@ class _Walk:
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
+        """Returns a robot from its table, inherited values included.  Raises PlanError."""
         values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
         if lacking := [needed for needed in NEEDED if needed not in values]:
             nowhere = "missing (neither here, nor in its group, nor in [robot])"
@@ -200,7 +208,7 @@ _T = TypeVar("_T", bound=Table)
 
 
 def _overlaid(table: _T, over: _T) -> _T:
-    """Returns a table with what another says in its place, key by key, in the tables within it too."""
+    """Returns a table in which the keys that `over` gives replace those of `table`; inner tables are merged in the same way."""
     merged = {}
     for key in type(table).model_fields:
         below, above = getattr(table, key), getattr(over, key)
@@ -212,7 +220,7 @@ def _overlaid(table: _T, over: _T) -> _T:
 
 
 def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:
-    """Returns the desired shape of a node with `count` children."""
+    """Returns the desired shape of a node with `count` children.  Raises PlanError."""
     if shape is None:
         return ShapePlan("points", ((0.0, 0.0),))
     points, kind, needed = _points(shape, count), "points", count
@@ -228,6 +236,7 @@ def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:
 
 
 def _points(shape: Shape, count: int) -> list[shapes.Point]:
+    """Returns the children's positions of a shape, or its shape variables for `vectors` [m]; neither is turned yet."""
     side, spacing = shape.side or 0.0, shape.spacing or 0.0
     match shape.kind:
         case "triangle":

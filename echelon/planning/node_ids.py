@@ -1,14 +1,15 @@
-"""Node ids: which number each drive has on its bus, so that no two drives use one identifier.  Raises PlanError.
+"""Chooses the node id of each drive on its bus, so that no two drives use the same identifier.
 
-On each bus identifiers are taken in this order:
+On each bus identifiers are assigned in this order:
 
-1. those that all drives of a protocol share, of every protocol on the bus;
-2. those of robots whose node id is their number;
+1. those that all drives of a protocol share, for every protocol on the bus;
+2. those of protocols in which a robot's number is its node id;
 3. those of node ids that the scenario gives;
-4. the rest: the lowest node ids that are free.  Drives whose identifiers lie furthest apart choose first, for they have the
-   least choice: where one protocol has 32 identifiers in a row, another has one in each of twelve places.
+4. for all other drives, those of the lowest node ids that are free.  Drives whose identifiers lie furthest apart choose first,
+   because they have the least choice: a node of one protocol has 32 identifiers in a row, a node of another protocol has
+   twelve, each in another place.
 
-Node 0 is never chosen: it is what a new drive has.
+Node id 0 is never chosen, because new drives have it.
 """
 
 from collections.abc import Sequence
@@ -21,30 +22,35 @@ from echelon.plugins import Part
 
 MAX_IDENTIFIER: Final = 0x7FF
 SHOWN: Final = 8
-"""Free node ids that a message names."""
+"""Number of free node ids that an error lists."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The drives of one robot, and the node ids that the scenario gives them, if it does."""
+    """The drives of one robot that need node ids."""
 
     key: str
-    """Of the robot's drive in the scenario"""
+    """Key of the robot's drive in the scenario"""
     path: str
+    """Path of the robot in the tree"""
     robot: int
+    """Index of the robot"""
     bus: int
+    """Number of the bus"""
     protocol: Part[Any]
+    """Protocol of the drives"""
     given: tuple[int, int] | None
+    """Node ids that the scenario gives, of the right and the left wheel's drive"""
 
     @property
     def addressing(self) -> Addressing:
-        """What planning asks of the protocol."""
+        """The protocol's object, with the interface that planning uses."""
         made: Addressing = self.protocol.made
         return made
 
 
 def ask(part: Part[Any], key: str, method: str, *arguments: Any) -> Any:
-    """Returns the answer of a protocol.  Raises PlanError if it raises: others may have written it."""
+    """Calls a method of a protocol and returns its answer.  Raises PlanError if the method raises, as a user's protocol may."""
     try:
         return getattr(part.made, method)(*arguments)
     except Exception as error:
@@ -52,7 +58,8 @@ def ask(part: Part[Any], key: str, method: str, *arguments: Any) -> Any:
 
 
 def choose_nodes(places: Sequence[Place]) -> dict[int, tuple[int, int]]:
-    """Returns the node ids of the right and the left wheel's drive, by robot."""
+    """Returns the node ids of the right and the left wheel's drive, by the robot's index.  Raises PlanError if they collide, or
+    too few are free."""
     chosen: dict[int, tuple[int, int]] = {}
     for bus in sorted({place.bus for place in places}):
         chosen |= _Bus([place for place in places if place.bus == bus]).choose()
@@ -60,16 +67,17 @@ def choose_nodes(places: Sequence[Place]) -> dict[int, tuple[int, int]]:
 
 
 class _Bus:
-    """One bus: who uses which of its identifiers."""
+    """One bus and the users of its identifiers."""
 
     def __init__(self, places: Sequence[Place]) -> None:
         self._places = places
         self._users: dict[int, str] = {}
-        """By identifier"""
+        """Who uses an identifier, in words, by the identifier"""
         self._known: dict[tuple[int, int], frozenset[int]] = {}
+        """Identifiers that a protocol has told, by protocol and node id"""
 
     def choose(self) -> dict[int, tuple[int, int]]:
-        """Returns the node ids of all drives on the bus, by robot."""
+        """Returns the node ids of all drives on the bus, by the robot's index.  Raises PlanError."""
         first_of = {place.protocol.use: place for place in reversed(self._places)}
         for use, place in first_of.items():
             shared = _checked(ask(place.protocol, place.key, "shared_identifiers"), place)
@@ -81,6 +89,7 @@ class _Bus:
         return self._by_number(numbered) | self._given(given) | self._lowest(waiting)
 
     def _by_number(self, places: Sequence[Place]) -> dict[int, tuple[int, int]]:
+        """Assigns robots' numbers as node ids.  Raises PlanError."""
         for place in places:
             use, nodes = place.protocol.use, place.addressing.nodes
             if place.given is not None:
@@ -105,7 +114,7 @@ class _Bus:
             for node in sorted(nodes):
                 if found := self._take(self._identifiers(place, node), f"those of {place.path}"):
                     collisions.append((place, found))
-        for place, found in collisions:  # now that all that is given is known, so is what is free
+        for place, found in collisions:  # reported last: only now is it known which node ids are free
             self._users = {can_id: user for can_id, user in self._users.items() if user != f"those of {place.path}"}
             free = self._free(place)
             more = ", …" if len(free) > SHOWN else ""
@@ -114,6 +123,7 @@ class _Bus:
         return chosen
 
     def _lowest(self, places: Sequence[Place]) -> dict[int, tuple[int, int]]:
+        """Assigns the lowest free node ids.  Raises PlanError if too few are free."""
         chosen = {}
         for place in sorted(places, key=self._spread, reverse=True):
             nodes = []
@@ -129,32 +139,32 @@ class _Bus:
         return chosen
 
     def _identifiers(self, place: Place, node: int) -> frozenset[int]:
-        """Returns the identifiers of a node."""
+        """Returns the identifiers that a node id takes.  Raises PlanError if the protocol's answer is wrong."""
         key = id(place.protocol), node
         if key not in self._known:
             self._known[key] = _checked(ask(place.protocol, place.key, "identifiers", node), place)
         return self._known[key]
 
     def _take(self, identifiers: frozenset[int], who: str) -> tuple[int, str] | None:
-        """Notes who uses identifiers; returns the lowest that another uses already, and who that is."""
+        """Notes the user of identifiers.  Returns the lowest identifier that has a user already, with that user, or None."""
         twice = min((can_id for can_id in identifiers if can_id in self._users), default=None)
         other = None if twice is None else (twice, self._users[twice])
         self._users = dict.fromkeys(identifiers, who) | self._users
         return other
 
     def _free(self, place: Place) -> list[int]:
-        """Returns the node ids whose identifiers nobody uses, in ascending order."""
+        """Returns the node ids whose identifiers are all free, in ascending order."""
         nodes = (node for node in place.addressing.nodes if node)
         return [node for node in nodes if self._users.keys().isdisjoint(self._identifiers(place, node))]
 
     def _spread(self, place: Place) -> int:
-        """Returns how far apart the identifiers of a node are."""
+        """Returns the difference between the largest and the smallest identifier of a node."""
         one = self._identifiers(place, place.addressing.nodes[-1])
         return max(one, default=0) - min(one, default=0)
 
 
 def _checked(answer: Any, place: Place) -> frozenset[int]:
-    """Returns the identifiers that a protocol says it uses.  Raises PlanError for anything else."""
+    """Returns a protocol's answer if it is a set of identifiers.  Raises PlanError for anything else."""
     if not (
         isinstance(answer, (set, frozenset))
         and all(type(can_id) is int and 0 <= can_id <= MAX_IDENTIFIER for can_id in answer)
@@ -167,12 +177,14 @@ def _checked(answer: Any, place: Place) -> frozenset[int]:
 
 
 def _collision(place: Place, found: tuple[int, str]) -> str:
+    """Returns the text about an identifier of `place` that has another user (`found`)."""
     can_id, who = found
     where = "" if place.given is None else f".node_ids = {list(place.given)}"
     return f"{place.key}{where}: identifier {can_id:#05x} of {place.path} collides with {who}"
 
 
 def _needed(place: Place) -> str:
+    """Returns the text about how many node ids a robot's drives need, and from which range."""
     nodes = place.addressing.nodes
     count = "one, twice," if len(place.addressing.wheels) == 1 else "two different ones"
     return f"{count} from {nodes[0]} to {nodes[-1]} are needed"

@@ -1,8 +1,8 @@
-"""From a scenario to a plan: the tree's members, the law's blocks, links, and whether all of it fits together.
+"""Makes the plan of a scenario: members, blocks, links and events, and checks that they fit together.
 
-What a single table cannot see is checked on the way: periods that divide each other, shapes of the right size, gains of
-the right shape, rules that fit nothing, robots that start in each other's place.  Raises PlanError with a line for each
-mistake: the key, the value and what is allowed.
+The tables of a scenario check their own values.  This module checks values against each other: periods must divide each
+other, shapes and gains must have the right size, rules must fit something, and robots must start in different places.  It
+raises PlanError with a line for each mistake: the key, the value and what is allowed.
 """
 
 from collections.abc import Sequence
@@ -36,15 +36,15 @@ from echelon.scenario.tables import Law, LinkRule, Scenario, Uniform
 from echelon.scenario.values import path_matches
 
 MAX_DELAY: Final = 1e6
-"""[s]"""
+"""Largest delay of a link [s]"""
 SHOWN_NAMES: Final = 12
-"""How many members a message lists."""
+"""Number of members that an error lists"""
 
 
 def make_plan(scenario: Scenario, registry: Registry) -> Plan:
-    """Returns the plan of a scenario; parts that it does not name come from `registry`.
+    """Returns the plan of a scenario.  Default parts come from `registry`.
 
-    Raises PlanError with all mistakes that do not hide each other."""
+    Raises PlanError with all mistakes that can be found; a mistake may hide others that depend on it."""
     robots, nodes, can = make_members(scenario, registry)
     mistakes = Mistakes()
     bus_roles: tuple[BusRolePlan, ...] = ()
@@ -69,8 +69,6 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
             with mistakes.noted():
                 fitting(blocks, claim.block, f"claims.{at}.block")
         coupling = make_coupling(scenario.law, blocks)
-    with mistakes.noted():
-        _check_law(scenario.law)
     with mistakes.noted():
         links = _links(scenario.links, robots, nodes, bus_roles, can)
     with mistakes.noted():
@@ -100,6 +98,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
 
 
 def _duration_ns(scenario: Scenario, root: NodePlan) -> int:
+    """Returns the length of the run [ns].  Raises PlanError if it is not a multiple of the root's period."""
     duration_ns = nanoseconds(scenario.duration, "duration")
     if duration_ns % root.period_ns:
         period = root.period_ns / 1e9
@@ -108,7 +107,7 @@ def _duration_ns(scenario: Scenario, root: NodePlan) -> int:
 
 
 def _check_law(law: Law) -> None:
-    """Refuses keys that the law makes no use of."""
+    """Raises PlanError if the scenario gives gains or `lead` to a law that does not use them."""
     for key, value, unset in (("gains", law.gains, []), ("lead", law.lead, 0.0)):
         if value != unset and key not in law.parameters.made.uses:
             what = "has gains of its own, in law.parameters" if key == "gains" else "does not look ahead"
@@ -116,7 +115,7 @@ def _check_law(law: Law) -> None:
 
 
 def _bus_roles(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanPlan) -> tuple[BusRolePlan, ...]:
-    """Returns bridge and virtual drives where the torque path is closed."""
+    """Returns the bridge and the virtual drives, if there are any; empty if torque is mirrored.  Raises PlanError."""
     if not can.closed:
         return ()
     if not can.enabled:
@@ -127,7 +126,7 @@ def _bus_roles(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan], can: CanP
 
 
 def _check_starts(robots: Sequence[RobotPlan], radius: float) -> None:
-    """Refuses robots that start in one place, or, where they avoid each other, within the radius they must keep."""
+    """Raises PlanError if two robots start in the same place, or at a distance of at most `radius` [m]."""
     mistakes: dict[str, str] = {}
     for one, other in combinations(robots, 2):
         distance = dist(one.start, other.start)
@@ -151,7 +150,9 @@ def _links(
     bus_roles: Sequence[BusRolePlan],
     can: CanPlan,
 ) -> tuple[LinkPlan, ...]:
-    """Lists all links, receiver by receiver, and gives those between members what the last fitting rule says."""
+    """Returns all links.  Links of the tree, and from robots to the bridge, get delay and loss from the last rule that fits.
+
+    Raises PlanError if a rule fits no link."""
     all_roles: list[RobotPlan | NodePlan | BusRolePlan] = [*robots, *nodes, *bus_roles]
     names = [one.name for one in all_roles]
     limits = [_delay_ns(rule, f"links.{at}.delay") for at, rule in enumerate(rules)]
@@ -169,7 +170,7 @@ def _links(
                 rule, (delay_min_ns, delay_max_ns) = each, limit
         timeout_ns = NEVER_NS
         if (rule.policy or ("hold_then_stop" if can.closed else "hold")) == "hold_then_stop":
-            # What comes more rarely than that is not late when it is that old.
+            # A message that comes once per period may be a whole period old; so the default is at least two periods.
             wanted = can.watchdog_ns if rule.timeout is None else round(rule.timeout * 1e9)
             timeout_ns = max(wanted, 2 * period_ns) if rule.timeout is None else wanted
         links.append(LinkPlan(source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, timeout_ns))
@@ -180,20 +181,22 @@ def _links(
 
 
 def _torque_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan]) -> list[tuple[int, int, Channel, int]]:
-    """Returns the links from robots to the bridge: over them go torques, and they can be late or lose."""
+    """Returns source, receiver, channel and period [ns] of the links from robots to the bridge, which carry torques.  They can
+    have delay and loss."""
     return [
         (robot.index, bridge.index, Channel.TORQUE, bridge.period_ns) for bridge in bus_roles[:1] for robot in robots
     ]
 
 
 def _shaft_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan], can: CanPlan) -> list[LinkPlan]:
-    """Returns the links that stand for no network: shafts, and what the bus itself does (bridge.timing.arbitration)."""
+    """Returns the links that do not stand for a network, but for shafts and for the bus.  They have no delay and no loss; the
+    delay of the bus is in `bridge.timing.arbitration`."""
     links: list[LinkPlan] = []
     if not can.closed:
         return links
     bridge, *drives = bus_roles
     period_ns, first_ns = bridge.period_ns, bridge.first_ns
-    # A plant whose bridge says nothing has no torque: its drives have stopped by then.
+    # A robot that gets no torques from the bridge for this time uses none: by then its drives have stopped.
     timeout_ns = max(can.watchdog_ns, 2 * period_ns)
     links += [LinkPlan(bridge.index, robot.index, Channel.WHEELS, period_ns, timeout_ns=timeout_ns) for robot in robots]
     for each in drives:
@@ -204,7 +207,7 @@ def _shaft_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan], 
 
 
 def _tree_links(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan]) -> list[tuple[int, int, Channel, int]]:
-    """Returns source, receiver, channel and period of every link, in the order of receivers, channels and sources."""
+    """Returns source, receiver, channel and period [ns] of every link of the tree, sorted by receiver, channel and source."""
     links = []
     for node in nodes:
         for child in node.children:
@@ -215,7 +218,7 @@ def _tree_links(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan]) -> list[
 
 
 def _delay_ns(rule: LinkRule, key: str) -> tuple[int, int]:
-    """Returns the bounds of a rule's delay, to the nearest nanosecond."""
+    """Returns the bounds of a rule's delay, to the nearest nanosecond.  Raises PlanError if it is too large."""
     if isinstance(rule.delay, Uniform):
         low, high, key = rule.delay.min, rule.delay.max, f"{key}.max"
     else:
@@ -226,7 +229,7 @@ def _delay_ns(rule: LinkRule, key: str) -> tuple[int, int]:
 
 
 def _why_unused(rule: LinkRule, key: str, names: Sequence[str], closed: bool) -> str:
-    """Returns why a rule fits no link."""
+    """Returns the text that says why a rule fits no link."""
     for end, pattern in (("source", rule.source), ("receiver", rule.receiver)):
         if not any(path_matches(pattern, name) for name in names):
             shown = ", ".join(reversed(names[-SHOWN_NAMES:]))

@@ -1,4 +1,4 @@
-"""Named shapes: where a node's children stand relative to each other, for people who would rather not write vectors."""
+"""Named shapes: positions of a node's children relative to each other [m], so that a scenario need not list them."""
 
 from math import cos, pi, radians, sin, sqrt
 
@@ -6,7 +6,7 @@ Point = tuple[float, float]
 
 
 def triangle(side: float) -> list[Point]:
-    """Returns an equilateral triangle: base from left to right, then the apex above it (the paper's Fig. 1)."""
+    """Returns an equilateral triangle: the base from left to right, then the apex above it (the paper's Fig. 1)."""
     return [(-side / 2, 0.0), (side / 2, 0.0), (0.0, side * sqrt(3) / 2)]
 
 
@@ -29,8 +29,8 @@ def column(count: int, spacing: float) -> list[Point]:
 
 
 def wedge(count: int, spacing: float, angle: float) -> list[Point]:
-    """Returns a V open to the rear: the first child in front, the others alternating left and right, each `spacing`
-    from the one before it in its arm; `angle` [rad] lies between the arms."""
+    """Returns a V open to the rear.  The first child is in front; the others alternate between the left and the right arm, each
+    at a distance of `spacing` from the one before it in its arm.  `angle` is the angle between the arms [rad]."""
     points = [(0.0, 0.0)]
     for k in range(1, count):
         along = spacing * ((k + 1) // 2)
@@ -39,7 +39,7 @@ def wedge(count: int, spacing: float, angle: float) -> list[Point]:
 
 
 def rotated(points: list[Point], degrees: float) -> list[Point]:
-    """Returns the points turned counter-clockwise about the origin."""
+    """Returns the points turned counter-clockwise about the origin by an angle [°]."""
     if degrees == 0.0:
         return points
     c, s = cos(radians(degrees)), sin(radians(degrees))

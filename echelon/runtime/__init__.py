@@ -1,1 +1,1 @@
-"""What carries messages between roles: links, mailboxes, the wire, Zenoh sessions, and who has which turn."""
+"""Transport of messages between roles: links, mailboxes, messages as bytes, Zenoh sessions, runners, and the order of turns."""

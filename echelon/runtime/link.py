@@ -1,13 +1,13 @@
-"""The link model: which message a receiver may use at a given instant.
+"""The link model: which message a receiver uses at a given instant (docs/architecture.md, 4.1 and 4.2).
 
-Every directed pair (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is
-lost, and how long it takes, is a pure function of (scenario seed, link, k): the same messages are lost in every engine,
-at every speed and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key names the
-link, the counter the message, so any draw can be made without the ones before it.
+Every triple (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is lost, and how
+long it takes, is a pure function of (scenario seed, link, k).  So the same messages are lost in every engine, at every speed
+and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key stands for the link, the
+counter for the message, so any draw can be made without the draws before it.
 
-A message is used at the first tick at or after its arrival, and the newest that has arrived is the one in use
-(policy *hold*): one that is overtaken arrives, but changes nothing.  On an *ideal* link, without delay and loss, that is the
-newest that was sent, and nothing is drawn.
+A receiver uses a message at its first instant at or after the arrival.  The newest message that has arrived is *in use*; a
+message that was overtaken arrives, but changes nothing.  On an *ideal* link, without delay and loss, the newest message that
+was sent is in use, and nothing is drawn.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from echelon.messages import Channel, Values
 from echelon.plan.plan import LinkPlan
 
 _BLOCK: Final = 512
-"""Messages per block of draws; each takes two 64-bit words, and one count of the Philox counter gives four."""
+"""Messages per block of draws.  A message takes two 64-bit words; each count of the Philox counter gives four words."""
 
 
 def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
@@ -32,7 +32,7 @@ def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
 
 
 def draws(key: int, block: int) -> Values:
-    """Returns numbers uniform in [0, 1), shape (_BLOCK, 2): the loss and the delay draw of each message of a block."""
+    """Returns the draws of a block, uniform in [0, 1), shape (_BLOCK, 2): for each message its loss and its delay."""
     words = Philox(key=key, counter=block * (_BLOCK // 2)).random_raw(2 * _BLOCK)
     uniform: Values = np.multiply(words >> np.uint64(11), 2.0**-53)
     return uniform.reshape(_BLOCK, 2)
@@ -40,8 +40,10 @@ def draws(key: int, block: int) -> Values:
 
 @dataclass(frozen=True, slots=True)
 class LinkCounts:
-    """What became of a link's messages; sent = delivered + lost + in flight.  Ages [ns] are of what was in use, at each
-    use; `held` counts the uses of a message, after the instant it was sent in, that had been used before."""
+    """Counts of a link's messages; sent = delivered + lost + in_flight.
+
+    `used` counts uses.  `held` counts the uses in which the message was older than the instant and had been used before.
+    `age_mean_ns` and `age_max_ns` are the mean and the largest age of the message in use, over all uses."""
 
     source: int
     receiver: int
@@ -57,7 +59,7 @@ class LinkCounts:
 
 
 class Link:
-    """One directed link with its state; `newest` must be asked for instants in ascending order."""
+    """One directed link with its state.  `newest` must be called with ascending instants."""
 
     __slots__ = (
         "_age_max",
@@ -94,7 +96,7 @@ class Link:
         self._age_sum = self._age_max = 0
 
     def sent_ns(self, sequence: int) -> int:
-        """Returns when message number `sequence` is sent [ns]."""
+        """Returns the instant at which message number `sequence` is sent [ns]."""
         return self._first_ns + sequence * self._period_ns
 
     def fate(self, sequence: int) -> int | None:
@@ -135,7 +137,7 @@ class Link:
         return self._newest
 
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
-        """Counts one use, at `time_ns`, of the message that was sent at `sent_ns`."""
+        """Counts a use at `time_ns` of message number `sequence`, which was sent at `sent_ns`."""
         self._used += 1
         if sent_ns != time_ns:
             age = time_ns - sent_ns
@@ -146,7 +148,7 @@ class Link:
         self._last = sequence
 
     def counts(self) -> LinkCounts:
-        """Returns what became of the messages up to the last instant that `newest` was asked for."""
+        """Returns the counts up to the last instant for which `newest` was called."""
         sent, delivered = self._sent, self._delivered
         if self._ideal:
             sent = delivered = self._newest + 1

@@ -1,10 +1,10 @@
-"""The mailbox: between messages as they come and a role's stages as they want them.
+"""The mailbox: takes messages in any order, and hands each stage of a role the messages in use at its instant.
 
-Data flow makes the lockstep: at time t a stage needs, of each input, exactly the message its link says is in use at t.
-The link knows that number without having seen the message, so the mailbox can say what is still missing, and a stage
-that runs has heard the same whatever the order, the speed or the process in which messages came.
+At time t a stage needs from each input the message that the link says is in use at t.  The link knows its number without
+having seen the message.  So the mailbox knows which messages are still missing, and a stage gets the same messages whatever
+the order, the speed and the process in which they came.  This makes the lockstep (docs/architecture.md, 3.3).
 
-A message that is older than its link's timeout (policy `hold_then_stop`) is as if it had not come.
+A message older than its link's timeout (policy `hold_then_stop`) is not used: the stage gets None.
 """
 
 from dataclasses import dataclass, field
@@ -17,31 +17,36 @@ from echelon.role import Input, Role
 from echelon.runtime.link import Link, LinkCounts
 
 LEAD: Final = 32
-"""Periods by which a role in a lockstep may be ahead of any of its sources.  A link that is late or loses would let it run
-on without them, and what it sends would pile up in front of them."""
+"""Number of periods by which a role in a lockstep may be ahead of any of its sources.  On a link with delay or loss a role
+needs no new messages for a while; without this limit it would run far ahead, and its messages would pile up at its sources."""
 SLACK: Final = 4 * LEAD
-"""Messages that an input may hold beyond those in flight before it looks for lost ones among them."""
+"""Number of messages that an input holds beyond those in flight before it removes messages that its link loses."""
 
 
 @dataclass(slots=True)
 class _Slot:
-    """One input: its link, the message in use with its number, and the newer ones that have come, by number."""
+    """One input of a role: its link and the messages that have come."""
 
     link: Link
     plan: LinkPlan
-    many: int
-    """More messages than this cannot all be in flight: those that the link loses are then forgotten."""
+    capacity: int
+    """If `newer` holds more messages than this, some of them are lost ones, and these are removed"""
     lead_ns: int | None
-    """How far the role may be ahead of the newest message that has come, whatever the link does with it; None: no limit, or
-    an ideal link, where the role waits for every message anyway."""
+    """How far the role may be ahead of the newest message that has come, even if the link loses that message.  None: no limit;
+    so on an ideal link, where the role waits for every message anyway"""
     current: Message | None = None
+    """The message in use"""
     in_use: int = -1
+    """The number of `current`"""
     newer: dict[int, Message] = field(default_factory=dict)
+    """Messages that have come with a number above `in_use`, by number"""
     newest: int = -1
+    """The largest number of a message that has come"""
 
 
 class Mailbox:
-    """All inputs of one role; with `paced`, the role also misses something while it is `LEAD` ahead of a source."""
+    """All inputs of one role.  With `paced`, a link also counts as missing while the role is `LEAD` periods ahead of its
+    source."""
 
     def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
         names = [one.name for one in plan.all_roles]
@@ -59,15 +64,15 @@ class Mailbox:
         }
         self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
         self.unexpected = 0
-        """Messages that no link of this role accounts for."""
+        """How many messages came that belong to no link of this role."""
         self.misshapen = 0
-        """Messages with a number of values that their channel does not have."""
+        """How many messages came with a wrong number of values for their link."""
 
     def _slot(self, slot_input: Input) -> _Slot:
         return self._slots[slot_input.channel, slot_input.source]
 
     def deliver(self, message: Message) -> None:
-        """Takes a message, in whatever order it comes."""
+        """Takes a message; the order does not matter.  Messages of no link and of a wrong size are counted and dropped."""
         slot = self._slots.get((message.channel, message.source))
         if slot is None:
             self.unexpected += 1
@@ -79,7 +84,7 @@ class Mailbox:
                 slot.newest = message.sequence
 
     def missing(self, stage: int, time_ns: int) -> list[Link]:
-        """Returns the links whose message in use at `time_ns` has not come; empty if the stage can run."""
+        """Returns the links whose message in use at `time_ns` has not come; the list is empty if the stage can run."""
         waiting = []
         for slot in self._stage_slots[stage]:
             link = slot.link
@@ -91,10 +96,10 @@ class Mailbox:
         return waiting
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
-        """Returns what the stage hears at `time_ns`.
+        """Returns the messages in use at `time_ns`, one for each input of the stage; None where no message is in use.
 
-        In a lockstep nothing is missing by then.  On a wall clock something may be: then the newest that has come is
-        used instead, as the link's policy has it.
+        In a lockstep no message is missing when this is called.  On a wall clock one may be missing; then the newest message
+        that has come takes its place, unless it is older than the timeout of the link.
         """
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
@@ -105,11 +110,11 @@ class Mailbox:
                     number = self._newest_come(slot, time_ns)
                 message = newer.pop(number, None)
                 if message is not None:
-                    if newer:  # those that this one overtakes
+                    if newer:  # forget the messages that this one overtakes
                         for overtaken in range(slot.in_use + 1, number):
                             newer.pop(overtaken, None)
                     slot.current, slot.in_use = message, number
-                elif len(newer) > slot.many:
+                elif len(newer) > slot.capacity:
                     slot.newer = {each: newer[each] for each in newer if link.fate(each) is not None}
             current = slot.current
             if current is None or not current.values.size or time_ns - current.time_ns > slot.plan.timeout_ns:
@@ -121,7 +126,7 @@ class Mailbox:
 
     @staticmethod
     def _newest_come(slot: _Slot, time_ns: int) -> int:
-        """Returns the number of the newest message that has come and that the link lets arrive by now, or -1."""
+        """Returns the number of the newest message that has come and has arrived by the rules of its link, or -1."""
         return max((number for number in slot.newer if slot.link.arrived(number, time_ns)), default=-1)
 
     def counts(self) -> list[LinkCounts]:

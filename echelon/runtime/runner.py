@@ -1,15 +1,15 @@
-"""Runs one role over a session: in lockstep (virtual time), or paced by a clock (wall time).
+"""Runs one role over a session: in lockstep (virtual time), or paced by a clock (wall clock).
 
-In a lockstep the role moves as messages come: the handler of a message puts it into the mailbox and runs every stage that
-misses nothing any more, in Zenoh's own thread.  Between messages the process sleeps.  The main thread wakes only for what
-may wait for others, sending batches to those who watch, and for long stretches without waiting.
+In a lockstep the role moves as messages come.  Zenoh's thread calls the handler of a message; the handler puts the message
+into the mailbox and runs every stage that misses nothing any more.  Between messages the process sleeps.  The main thread
+wakes only for work that may block, which is sending batches of copies, and for long sequences of stages.
 
-Zenoh's thread also does the sending, so it must never wait: not for the main thread (what comes while that one moves the
-role is put aside for it), and not for room to put a message (`mailbox.LEAD` bounds what may be on the way to a receiver
-that reads nothing; a session has room for 128 KiB).
+Zenoh's thread also sends, so it must never block.  It does not wait for the main thread: messages that come while the main
+thread moves the role are put aside, and the main thread takes them.  It does not wait for room to put a message:
+`mailbox.LEAD` bounds the messages on their way to a receiver that reads nothing, and a session has room for 128 KiB.
 
-On a wall clock it is the same, but that the main thread wakes at each instant and each deadline, and that a stage whose
-deadline has come goes on with the newest it has, and counts what was late.
+On a wall clock the main thread also wakes at each instant and each deadline.  A stage whose deadline has come runs with the
+newest messages that have come, and is counted as late if one was missing.
 """
 
 import threading
@@ -29,50 +29,53 @@ from echelon.runtime.turns import deadline_ns
 from echelon.runtime.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
 
 STALL_S: Final = 1.0
-"""A lockstep that has not moved for so long says whom it waits for, and goes on waiting."""
+"""After this time without movement a lockstep reports which members it waits for, and goes on waiting [s]."""
 BATCH_BYTES: Final = 12_000
-"""Watchers get messages in batches of about this size in virtual time: far fewer deliveries."""
+"""Size of a batch of copies in virtual time [bytes], about; batches need far fewer deliveries than single messages."""
 MAX_BATCHES: Final = 4
-"""So many batches may wait for a slow watcher before the role waits, too."""
+"""Number of batches that may wait for a slow receiver of copies; with more the role waits, too."""
 STRETCH: Final = 64
-"""Stages run without a pause; what goes on for longer in Zenoh's thread is the main thread's, so that others get a word."""
+"""Number of stages that run in Zenoh's thread at a stretch.  A longer sequence goes on in the main thread, so that Zenoh's
+thread can receive."""
 
 OnWait = Callable[[int, list[int]], None]
-"""(instant [ns], indices of the members waited for)"""
+"""Called with an instant [ns] and the indices of the members that the role waits for."""
 
 
 @dataclass(slots=True)
 class RunnerCounts:
-    """What a runner saw."""
+    """Counts of a runner."""
 
     messages: int = 0
+    """Messages sent"""
     refused: dict[str, int] = field(default_factory=dict)
-    """Payloads that were no messages for this role, by reason."""
+    """Received payloads that were not messages for this role, by reason"""
     late: int = 0
-    """Stages that ran at their deadline without something they wanted (wall clock)."""
+    """Stages that ran at their deadline with an input missing (wall clock)"""
     stages: int = 0
+    """Stages that ran (wall clock)"""
     latest_ns: int = 0
-    """Largest lateness of a stage after its deadline (wall clock)."""
+    """Largest time by which a stage ran after its deadline [ns] (wall clock)"""
 
 
-class Watch:
-    """Gathers copies of a member's messages into batches, for those who watch the run."""
+class CopyBatcher:
+    """Gathers copies of a member's messages into batches of about `limit` bytes, for the recorder and other observers."""
 
     def __init__(self, publisher: Publisher, limit: int) -> None:
         self._put, self._limit = publisher.put, limit
         self._payloads: list[bytes] = []
         self._size = 0
         self.batches: list[bytes] = []
-        """Batches to be sent."""
+        """Complete batches that are not sent yet"""
 
     def add(self, payload: bytes) -> bool:
-        """Takes one message; returns True if that completes a batch."""
+        """Adds a copy of one message; returns True if this completes a batch."""
         self._payloads.append(payload)
         self._size += len(payload)
         return self._size >= self._limit and self.close()
 
     def close(self) -> bool:
-        """Ends the batch in progress; returns True if there was something in it."""
+        """Completes the batch in progress; returns False if it is empty."""
         if not self._payloads:
             return False
         self.batches.append(join(self._payloads))
@@ -81,14 +84,16 @@ class Watch:
         return True
 
     def send(self) -> None:
-        """Sends all complete batches; waits for watchers that are behind."""
+        """Sends all complete batches; in lockstep it blocks while a receiver is behind."""
         while self.batches:
             self._put(self.batches[0])
             del self.batches[0]
 
 
 class Runner:
-    """One role of a plan, connected.  Declares everything it sends and receives when it is made."""
+    """One role of a plan, connected to a session.  The constructor declares all that the role sends and receives.
+
+    `watched` sends copies of its messages to observers; `virtual` is for `lockstep`, otherwise use `wall_clock`."""
 
     def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool, virtual: bool) -> None:
         members = plan.all_roles
@@ -98,27 +103,27 @@ class Runner:
         self.counts = RunnerCounts()
         channels = sorted({link.channel for link in plan.links if link.source == role.index})
         self._puts = {channel: session.publisher(data_key(run, member.path, channel)).put for channel in channels}
-        self._watch: Watch | None = None
+        self._copies: CopyBatcher | None = None
         if watched:
-            watch = session.publisher(watch_key(run, member.role, member.name))
-            self._watch = Watch(watch, BATCH_BYTES if virtual else 0)
+            publisher = session.publisher(watch_key(run, member.role, member.name))
+            self._copies = CopyBatcher(publisher, BATCH_BYTES if virtual else 0)
         self._tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._stages = list(enumerate(role.stages))
 
-        self._stopping = False  # asked to, by a signal
+        self._stopping = False  # a signal asked the run to stop
         self._idle = False  # the main thread waits and may be interrupted
 
-        # Whoever holds the lock may touch the mailbox and move the role.
+        # The thread that holds the lock may use the mailbox and move the role.
         self._lock = threading.Lock()
-        self._aside: deque[bytes] = deque()  # what came while the main thread had the lock
-        self._wake = threading.Event()  # there is something for the main thread
-        self._in_handler = False  # the handler may move the role; otherwise that is the main thread's turn
+        self._aside: deque[bytes] = deque()  # payloads that came while the main thread had the lock
+        self._wake = threading.Event()  # set when the main thread has work
+        self._in_handler = False  # True: the handler moves the role; False: the main thread does
         self._time_ns = min(stage.first_ns for stage in role.stages)
-        self._at = 0
-        self._moved = 0
+        self._at = 0  # the stage that runs next at this instant
+        self._moved = 0  # stages passed so far, to see whether the role moves at all
         self._finished = False
         self._failure: BaseException | None = None
-        # On a wall clock: when run time 0 is, and how long after an instant each stage may wait.
+        # On a wall clock: run time 0 in `time.monotonic_ns`, and how long after an instant each stage may wait.
         self._start_ns: int | None = None
         self._allowed_ns: list[int] = []
 
@@ -127,32 +132,44 @@ class Runner:
         session.subscribe(keys, self._receive if virtual else self._receive_paced)
 
     def lockstep(self, on_wait: OnWait) -> None:
-        """Runs the plan in virtual time, as fast as messages come; `on_wait` is told of every wait beyond `STALL_S`."""
+        """Runs the plan in virtual time, as fast as messages come.  After `STALL_S` without movement, and again after each
+        further `STALL_S`, it calls `on_wait`.
+
+            state             entered when                                  what happens, and what ends it
+            ----------------  --------------------------------------------  ----------------------------------------------
+            main thread       the start; a batch of copies is complete;     the main thread sends batches and runs stages;
+                              the handler has run `STRETCH` stages          it ends when a stage misses a message
+            handler           a stage misses a message                      Zenoh's thread runs the stages that a message
+                                                                            completes; the main thread sleeps
+            finished          the last instant of the plan is over          the main thread sends the last batch and returns
+        """
         last_moved = -1
         while True:
             with self._lock:
                 self._take_aside()
                 self._in_handler = not self._advance()
-                finished = self._finished  # from here on the handler may finish it, too, with a batch still to send
+                finished = (
+                    self._finished
+                )  # read under the lock: later the handler may finish, and leave a batch to send
             if self._failure is not None:
                 raise self._failure
-            if self._watch is not None:
-                self._watch.send()
+            if self._copies is not None:
+                self._copies.send()
             if finished:
                 return
             if not self._wait_for_wake():
                 with self._lock:
                     missing = [] if self._finished else self.mailbox.missing(self._at, self._time_ns)
                     moved, time_ns = self._moved, self._time_ns
-                    if self._watch is not None:
-                        self._watch.close()
+                    if self._copies is not None:
+                        self._copies.close()
                 if moved == last_moved and missing:
                     on_wait(time_ns, [link.plan.source for link in missing])
                 last_moved = moved
             self._wake.clear()
 
     def _wait_for_wake(self) -> bool:
-        """Waits until there is something for the main thread; returns False if that takes too long."""
+        """Waits until the main thread has work; returns False after `STALL_S` without any."""
         self._idle = True
         if self._stopping:
             raise SystemExit(0)
@@ -161,7 +178,7 @@ class Runner:
         return woken
 
     def _receive(self, payload: bytes) -> None:
-        """Takes a payload in Zenoh's thread, and moves the role as far as that lets it."""
+        """Takes a payload in Zenoh's thread in a lockstep, and runs the stages that miss nothing any more."""
         if not self._lock.acquire(blocking=False):
             self._aside.append(payload)
             self._wake.set()
@@ -173,19 +190,21 @@ class Runner:
             if self._in_handler and self._advance():
                 self._in_handler = False
                 self._wake.set()
-        except BaseException as error:  # nobody above would learn of it
+        except BaseException as error:  # Zenoh would drop it; the main thread raises it
             self._failure, self._in_handler = error, False
             self._wake.set()
         finally:
             self._lock.release()
 
     def _take_aside(self) -> None:
+        """Delivers the payloads that were put aside."""
         while self._aside:
             self._deliver(self._aside.popleft())
 
     def _advance(self) -> bool:
-        """Runs stages until one misses something; returns True if it stopped for another reason."""
-        mailbox, stages, watch = self.mailbox, self._stages, self._watch
+        """Runs stages until one misses a message, and returns False.  Returns True if it stops for another reason: the run is
+        over or has failed, `STRETCH` stages have run, or `MAX_BATCHES` wait."""
+        mailbox, stages, copies = self.mailbox, self._stages, self._copies
         for _ in range(STRETCH):
             if self._finished or self._failure is not None:
                 return True
@@ -194,24 +213,24 @@ class Runner:
                 if mailbox.missing(number, self._time_ns):
                     return False
                 if self._run_stage(number, stage, self._time_ns):
-                    self._wake.set()  # a batch is complete: the main thread sends it
+                    self._wake.set()  # a batch is complete, and the main thread sends it
             self._moved += 1
             self._at += 1
             if self._at == len(stages):
                 self._at = 0
                 self._time_ns += self._tick_ns
                 self._finished = self._time_ns > self.plan.duration_ns
-                if self._finished and watch is not None:
-                    watch.close()
-            if watch is not None and len(watch.batches) >= MAX_BATCHES:
+                if self._finished and copies is not None:
+                    copies.close()
+            if copies is not None and len(copies.batches) >= MAX_BATCHES:
                 return True
         return True
 
     def wall_clock(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
 
-        A stage runs as soon as nothing it wants is missing, in the handler of what came last; at the deadline of its turn
-        (`echelon.runtime.turns`) it runs with what there is.
+        A stage runs in the handler of the message that completes its inputs.  At the deadline of its turn
+        (`echelon.runtime.turns`) it runs with the messages that have come.
         """
         self._allowed_ns = [
             deadline_ns(self.plan, stage.turn, stage.depth, stage.period_ns) for stage in self.role.stages
@@ -228,7 +247,8 @@ class Runner:
             self._rest(wake_ns)
 
     def _pace(self) -> int:
-        """Runs the stages whose time has come; returns when to come again if nothing is received until then [ns]."""
+        """Runs the stages that are due; returns the instant of `time.monotonic_ns` at which it must be called again, even if
+        nothing is received until then."""
         mailbox, counts, start_ns = self.mailbox, self.counts, self._start_ns
         assert start_ns is not None
         while not self._finished:
@@ -251,13 +271,13 @@ class Runner:
             self._at = 0
             self._time_ns += self._tick_ns
             self._finished = self._time_ns > self.plan.duration_ns
-            if self._watch is not None:
-                self._watch.close()
-                self._watch.send()
+            if self._copies is not None:
+                self._copies.close()
+                self._copies.send()
         return start_ns + self._time_ns
 
     def _receive_paced(self, payload: bytes) -> None:
-        """Takes a payload on a wall clock, in Zenoh's thread, and moves the role as far as that lets it."""
+        """Takes a payload in Zenoh's thread on a wall clock, and runs the stages that are due."""
         if not self._lock.acquire(blocking=False):
             self._aside.append(payload)
             self._wake.set()
@@ -267,14 +287,14 @@ class Runner:
             self._deliver(payload)
             if self._start_ns is not None and self._failure is None:
                 self._pace()
-        except BaseException as error:  # nobody above would learn of it
+        except BaseException as error:  # Zenoh would drop it; the main thread raises it
             self._failure = error
             self._wake.set()
         finally:
             self._lock.release()
 
     def _rest(self, until_ns: int) -> None:
-        """Sleeps until an instant of `time.monotonic_ns`, or until there is something for the main thread."""
+        """Sleeps until an instant of `time.monotonic_ns`, or until the main thread has work."""
         self._idle = True
         if self._stopping:
             raise SystemExit(0)
@@ -283,14 +303,15 @@ class Runner:
         self._idle = False
 
     def stop(self) -> None:
-        """Breaks the run off with SystemExit in the main thread, between two messages; for a signal handler there."""
+        """Ends the run early, for a signal handler in the main thread: raises SystemExit there, at once if it waits, otherwise
+        before it waits again."""
         self._stopping = True
         if self._idle:
             self._idle = False
             raise SystemExit(0)
 
     def finish(self) -> None:
-        """Moves the role no more, and sends what is held back for those who watch."""
+        """Stops the role for good, sends the copies that are left, and completes the counts."""
         with self._lock:
             self._finished = True
             for reason, count in (
@@ -299,13 +320,13 @@ class Runner:
             ):
                 if count:
                     self.counts.refused[reason] = count
-            if self._watch is not None:
-                self._watch.close()
-        if self._watch is not None:
-            self._watch.send()
+            if self._copies is not None:
+                self._copies.close()
+        if self._copies is not None:
+            self._copies.send()
 
     def _run_stage(self, number: int, stage: Stage, time_ns: int) -> bool:
-        """Runs a stage and puts what it returns; returns True if that completes a batch for the watchers."""
+        """Runs a stage and sends its messages; returns True if this completes a batch of copies."""
         complete = False
         for message in stage.run(time_ns, self.mailbox.take(number, time_ns)):
             complete |= self._send(message)
@@ -315,9 +336,10 @@ class Runner:
         payload = encode(message)
         self.counts.messages += 1
         self._puts[message.channel](payload)
-        return self._watch is not None and self._watch.add(payload)
+        return self._copies is not None and self._copies.add(payload)
 
     def _deliver(self, payload: bytes) -> None:
+        """Puts a payload into the mailbox, or counts why it is refused."""
         try:
             message = decode(payload)
         except WireError as error:

@@ -1,12 +1,12 @@
-"""A process's connection to the others: bytes in, bytes out, and who is alive.
+"""A process's connection to other processes: payloads of bytes in and out, and the presence of processes.
 
-The only module that imports Zenoh.  It knows nothing of what the bytes mean.  There are two ways to be connected:
+This is the only module that imports Zenoh.  It does not know what the bytes mean.  There are two kinds of sessions:
 
 - *lockstep* (virtual time): reliable, in order, and blocking; a receiver that falls behind slows its senders down.
-- *wall clock*: a put never waits for anyone; what a slow or stopped receiver cannot take is dropped.
+- *wall clock*: a put never blocks; payloads that a slow or stopped receiver cannot take are dropped.
 
-Where the time of a small message goes is in waking threads.  So all of Zenoh shares one thread here, and what is received
-is handled in that thread: a role that works in the handler, and puts from it, needs no other thread to wake at all.
+Most of the time that a small message takes is spent in waking threads.  So all of Zenoh shares one thread here, and handlers
+run in that thread.  A role that works in the handler, and puts from it, wakes no other thread.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
-# Read once, when the first session opens.  A second worker thread would be one more hand-over for every message.
+# Zenoh reads this once, when the first session opens.  With a second worker thread each message would wake one more thread.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
     "(rx:(handover:app),tx:(handover:app),acc:(handover:app),net:(handover:app),app:(worker_threads:1))",
@@ -30,20 +30,21 @@ os.environ.setdefault(
 import zenoh
 
 Receive = Callable[[bytes], None]
-"""Takes one payload, in Zenoh's thread.  While it runs nothing else is received, so it must wait for nothing that only
-comes later; and it must handle its own errors, for nobody else learns of them."""
+"""Handler of one payload, called in Zenoh's thread.  While it runs nothing else is received, so it must not wait for a later
+payload.  It must handle its own errors, because Zenoh drops them."""
 
 LEASE_MS: Final = 120_000
-"""A process that stands still for longer is given up by its peers.  One that ends is noticed at once, by its sockets."""
+"""Peers close the connection to a process that stands still for longer than this [ms].  If a process ends, its peers notice
+that at once, because its sockets close."""
 _SUN_PATH: Final = 107  # bytes in the path of a Unix socket
 _thread: Final = threading.local()
 
 
 class Inbox:
-    """Payloads received and not yet taken, in order of arrival.  One thread takes.
+    """Payloads received and not yet taken, in order of arrival.  Only one thread may call `take`.
 
-    With `hold` (lockstep), nothing more is received while there are `high_water` of them: senders wait in their put, and
-    nothing is lost.  Otherwise the newest `high_water` are kept, and `dropped` counts the others.
+    With `hold` (lockstep), nothing more is received while the inbox holds `high_water` payloads: senders block in their put,
+    and nothing is lost.  Without it the newest `high_water` payloads are kept, and `dropped` counts the others.
     """
 
     def __init__(self, high_water: int, hold: bool) -> None:
@@ -54,10 +55,11 @@ class Inbox:
         self.dropped = 0
 
     def take(self, timeout_s: float | None = None) -> list[bytes]:
-        """Returns and forgets all that was received; waits for something if there is nothing, `timeout_s` at most."""
+        """Removes and returns all payloads.  If there are none, it first waits for one, at most `timeout_s`; None waits for
+        ever."""
         payloads = self._payloads
         if not payloads and timeout_s != 0:
-            self._some.clear()  # before looking again: one that comes now sets it anew
+            self._some.clear()  # cleared before the second look: a payload that comes after it sets the event again
             if not payloads:
                 self._some.wait(timeout_s)
         taken = [payloads.popleft() for _ in range(len(payloads))]
@@ -77,7 +79,7 @@ class Inbox:
                 self._room.wait()
 
     def _let_go(self) -> None:
-        """Holds nobody any more: Zenoh's thread, which may stand in `_receive`, is needed for closing."""
+        """Ends the holding of senders.  Zenoh's thread may be blocked in `_receive`, and closing a session needs it."""
         self._hold = False
         self._room.set()
 
@@ -87,11 +89,11 @@ class Publisher:
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self.put: Receive = publisher.put
-        """Sends a payload to every subscriber of the key; in lockstep it waits for those that are behind."""
+        """Sends a payload to every subscriber of the key; in lockstep it blocks while a subscriber is behind."""
 
 
 class Tokens:
-    """The liveliness tokens under one key expression, kept up to date."""
+    """The presence tokens (Zenoh's liveliness tokens) that match one key expression, kept up to date."""
 
     def __init__(self, on_lost: Callable[[str], None] | None) -> None:
         self._alive: set[str] = set()
@@ -99,12 +101,12 @@ class Tokens:
         self._on_lost = on_lost
 
     def alive(self) -> frozenset[str]:
-        """Returns the keys of the tokens that exist now."""
+        """Returns the keys of the tokens that exist at this moment."""
         with self._changed:
             return frozenset(self._alive)
 
     def wait(self, keys: Iterable[str], timeout_s: float) -> set[str]:
-        """Waits until each of `keys` (which may hold wildcards) has a token; returns those that have none in time."""
+        """Waits until each of `keys`, which may hold wildcards, has a token.  Returns those without one after `timeout_s`."""
         missing = {key: zenoh.KeyExpr(key) for key in keys}
 
         def all_here() -> bool:
@@ -131,17 +133,18 @@ class Tokens:
 
 
 class Session:
-    """An open connection to those it listens for and connects to, who may start before or after it.
+    """An open connection to other processes, which may start before or after this one.
 
-    Endpoints read `tcp/host:port` or `unixsock-stream//path`.  Data and tokens reach the processes at the other end of its
-    own links and no further.  Raises ValueError for an endpoint that is none, or cannot be listened on.
+    It listens on the endpoints `listen` and connects to the endpoints `connect`; an endpoint is `tcp/host:port` or
+    `unixsock-stream//path`.  Data and tokens reach only the processes that are connected directly.  Raises ValueError for an
+    endpoint that is malformed, or on which it cannot listen.
     """
 
     def __init__(
         self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool, own_receiver: bool = False
     ) -> None:
-        """`own_receiver` is for a process that puts besides holding an inbox in lockstep: it gives receiving a thread of its
-        own, so that sending goes on while receiving stands still.  It counts in a process's first session only."""
+        """`own_receiver` gives receiving a thread of its own, so that sending goes on while a full inbox blocks receiving.  A
+        process needs it if it both sends and has an inbox in lockstep.  Only a process's first session can set it."""
         if lockstep:
             _prefer_throughput()
         if own_receiver:
@@ -150,14 +153,16 @@ class Session:
         self._lockstep = lockstep
         self._session = _open(listen, connect, lockstep)
         self._inboxes: list[Inbox] = []
-        self._kept: list[object] = []  # what is declared lives as long as the session
+        self._kept: list[object] = []  # references that keep all declarations alive as long as the session
 
     def subscribe(self, keys: str | Iterable[str], receive: Receive) -> None:
-        """Calls `receive` with what is put under any of `keys`, in Zenoh's thread.  Exact keys are cheaper than wildcards."""
+        """Calls `receive`, in Zenoh's thread, with each payload put under any of `keys`.  Exact keys are cheaper than
+        wildcards."""
 
         def handle(sample: zenoh.Sample) -> None:
             if not hasattr(_thread, "state"):
-                # Keeps Python's state of this thread: made and unmade for every message, it costs more than the message.
+                # Keeps Python's state of this thread.  Otherwise it is made and destroyed for every message, which takes
+                # longer than the message.
                 _thread.state = ctypes.pythonapi.PyGILState_Ensure()
             receive(sample.payload.to_bytes())
 
@@ -166,9 +171,11 @@ class Session:
             self._kept.append(self._session.declare_subscriber(key, handler))
 
     def inbox(self, keys: str | Iterable[str], high_water: int = 1024) -> Inbox:
-        """Returns an inbox for what is put under any of `keys`.  In lockstep, all that this process receives stands still
-        while it is full: its owner must keep taking, and wait for nothing else."""
-        # Zenoh's thread needs the interpreter for every payload; its owner, busy, would let go of it only every 5 ms.
+        """Returns an inbox for the payloads put under any of `keys`.
+
+        In lockstep, a full inbox blocks everything that this process receives.  So its owner must keep calling `take`, and
+        must not wait for anything else."""
+        # Zenoh's thread needs Python's global lock for each payload; by default a busy thread gives it up only every 5 ms.
         sys.setswitchinterval(1e-4)
         inbox = Inbox(high_water, self._lockstep)
         self._inboxes.append(inbox)
@@ -176,24 +183,26 @@ class Session:
         return inbox
 
     def publisher(self, key: str) -> Publisher:
-        """Declares that this process will put payloads under `key`."""
+        """Declares that this process puts payloads under `key`; returns the publisher."""
         control = zenoh.CongestionControl.BLOCK if self._lockstep else zenoh.CongestionControl.DROP
         publisher = self._session.declare_publisher(key, congestion_control=control)
         self._kept.append(publisher)
         return Publisher(publisher)
 
     def declare_token(self, key: str) -> None:
-        """Shows that this process is alive until its session ends.  Whoever sees it reaches all declared before it."""
+        """Declares a presence token, which exists until the session ends.  A process that sees the token also sees all that was
+        declared before it."""
         self._kept.append(self._session.liveliness().declare_token(key))
 
     def watch_tokens(self, key: str, on_lost: Callable[[str], None] | None = None) -> Tokens:
-        """Follows the tokens under `key`.  `on_lost` is called, in a thread of its own, with the key of each that ends."""
+        """Returns the tokens that match `key`.  `on_lost` is called, in a thread of its own, with the key of each token that
+        ends."""
         tokens = Tokens(on_lost)
         self._kept.append(self._session.liveliness().declare_subscriber(key, tokens._receive, history=True))
         return tokens
 
     def close(self) -> None:
-        """Ends the connection after delivering what was put.  Not to be called from a handler."""
+        """Delivers all that was put, then ends the connection.  A handler must not call it."""
         for inbox in self._inboxes:
             inbox._let_go()
         self._session.close()  # type: ignore[no-untyped-call]
@@ -208,10 +217,10 @@ class Session:
 
 
 def loopback_endpoints(count: int) -> list[str]:
-    """Returns endpoints for the processes of one run on this machine, free at the moment of asking.
+    """Returns endpoints for the processes of one run on this machine.  Their ports are free at the moment of the call.
 
-    TCP, for a Unix socket wakes the sender's thread whenever the receiver has read.  Every run draws an address of its
-    own in 127.0.0.0/8, so that runs do not meet.
+    The endpoints use TCP, because a Unix socket wakes the sender's thread each time the receiver has read.  Every run draws a
+    random address in 127.0.0.0/8, so that two runs do not use the same one.
     """
     host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
     probes = [socket.create_server((host, 0)) for _ in range(count)]
@@ -222,33 +231,35 @@ def loopback_endpoints(count: int) -> list[str]:
 
 
 def _prefer_throughput() -> None:
-    """Lets a woken process wait its turn instead of interrupting the one that woke it.  Needs no privilege."""
+    """Sets the batch scheduling policy for this process: when it is woken, it does not interrupt the process that woke it.
+    This needs no privilege."""
     if os.sched_getscheduler(0) == os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zenoh.Session:
+    """Returns an open Zenoh session.  Raises ValueError for a wrong endpoint."""
     for endpoint in [*listen, *connect]:
         _check(endpoint)
     settings: dict[str, object] = {
         "mode": "peer",
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": -1,  # in the background, for ever
+        "connect/timeout_ms": -1,  # go on connecting in the background, for ever
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 5, "period_max_ms": 20, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
-        # Not the low-latency transport: its put moves to another thread when it is called in Zenoh's own.
+        # The low-latency transport is slower here: a put in Zenoh's thread moves to another thread.
         "transport/unicast/lowlatency": False,
         "transport/unicast/qos/enabled": not lockstep,
-        # Each received message holds one 64 KiB buffer until it is taken.  With a single one (the default) nearly every
+        # Each received message holds one 64 KiB buffer until it is taken.  With a single buffer (the default) nearly every
         # message allocates and clears a new one.
         "transport/link/rx/buffer_size": 4 * 65536,
     }
     if lockstep:
-        # Whoever is stopped is waited for, with all that was put for it; the run's supervisor decides when to give up.
+        # A peer that stands still is waited for, and what was put for it is kept; the run's supervisor decides when to give up.
         settings["transport/link/tx/lease"] = LEASE_MS
         settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = LEASE_MS * 1000
     config = zenoh.Config()
@@ -261,7 +272,8 @@ def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zeno
 
 
 def _check(endpoint: str) -> None:
-    """Raises ValueError for what Zenoh would try again and again in the background, or report without the endpoint."""
+    """Raises ValueError for a malformed endpoint.  Zenoh would retry some of them for ever in the background, and report others
+    without naming the endpoint."""
     protocol, _, address = endpoint.partition("/")
     if protocol == "unixsock-stream":
         length = len(os.fsencode(address))

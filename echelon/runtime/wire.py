@@ -1,8 +1,9 @@
-"""The wire: messages as bytes, and the keys they travel under.
+"""Messages as bytes, and the keys under which they are sent (docs/architecture.md, 3.7).
 
-Header, little endian (32 bytes): schema version u16, channel u8, zero u8, source u32, sequence u64, time [ns] i64,
-number of values u32, zero u32; then that many float64.  The schema version stands here and in the presence tokens,
-never in a data key: a peer of another version is refused by name and not met with silence.
+A payload is a header of 32 bytes, little endian, and then the values as float64.  The header is: schema version u16, channel
+u8, zero u8, source u32, sequence u64, time [ns] i64, number of values u32, zero u32.  The schema version is in the header
+and in the presence tokens, but not in the keys of data.  So data of another version arrive and are refused with a reason;
+with the version in the key they would not arrive at all.
 """
 
 import struct
@@ -15,12 +16,12 @@ from echelon.messages import Channel, Message
 SCHEMA_VERSION: Final = 1
 HEADER: Final = struct.Struct("<HBBIQqII")
 REASONS: Final = 32
-"""Reasons that refusals are counted by."""
+"""Largest number of different reasons by which refusals are counted."""
 _CHANNELS: Final = {int(channel): channel for channel in Channel}
 _LENGTH: Final = struct.Struct("<I")
 _VERSION: Final = struct.Struct("<H")
 _FLOAT64: Final = np.dtype("<f8")
-# Bound once, for one message is decoded for every message of every tick.
+# Looked up once here, because `decode` runs for every message of every tick.
 _HEADER_SIZE: Final = HEADER.size
 _unpack: Final = HEADER.unpack_from
 _view: Final = np.frombuffer
@@ -28,7 +29,7 @@ _channel_of: Final = _CHANNELS.get
 
 
 class WireError(ValueError):
-    """Bytes that are no message of ours; `reason` is short enough to count by."""
+    """A payload is not a valid message.  `reason` is short, and refusals are counted by it."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -36,14 +37,15 @@ class WireError(ValueError):
 
 
 def count_refusal(counts: dict[str, int], reason: str) -> None:
-    """Counts a refusal by its reason; whoever sends garbage makes up no more than `REASONS` reasons."""
+    """Counts a refusal by its reason in `counts`.  After `REASONS` different reasons all new ones count as "other reasons", so
+    that random bytes cannot make `counts` grow without bound."""
     if reason not in counts and len(counts) >= REASONS:
         reason = "other reasons"
     counts[reason] = counts.get(reason, 0) + 1
 
 
 def encode(message: Message) -> bytes:
-    """Returns the message's bytes."""
+    """Returns a message as bytes."""
     values = message.values
     return (
         HEADER.pack(
@@ -54,7 +56,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(payload: bytes) -> Message:
-    """Returns the message; its values are a view of `payload`.  Raises WireError on anything else."""
+    """Returns the message of a payload; its values are a view of `payload`.  Raises WireError if it is not a valid message."""
     size = len(payload)
     if size < _HEADER_SIZE:
         raise _refusal(payload)
@@ -66,7 +68,8 @@ def decode(payload: bytes) -> Message:
 
 
 def _refusal(payload: bytes) -> WireError:
-    """Returns what is wrong with bytes that are no message; the version first, for it says what the rest may mean."""
+    """Returns the error for a payload that is not a valid message.  The version is checked first, because the meaning of the
+    other bytes depends on it."""
     if len(payload) >= _VERSION.size:
         (version,) = _VERSION.unpack_from(payload)
         if version != SCHEMA_VERSION:
@@ -80,12 +83,12 @@ def _refusal(payload: bytes) -> WireError:
 
 
 def join(payloads: list[bytes]) -> bytes:
-    """Returns several messages as one payload, for those who watch a run and may receive it in portions."""
+    """Returns a batch: several payloads as one, each after its length.  The recorder and other observers receive batches."""
     return b"".join([part for payload in payloads for part in (_LENGTH.pack(len(payload)), payload)])
 
 
 def split(batch: bytes) -> list[bytes]:
-    """Inverse of `join`.  Raises WireError on a batch that ends early."""
+    """Returns the payloads of a batch, the inverse of `join`.  Raises WireError if the batch ends within a payload."""
     payloads, at = [], 0
     while at < len(batch):
         if at + _LENGTH.size > len(batch):
@@ -99,16 +102,16 @@ def split(batch: bytes) -> list[bytes]:
 
 
 def data_key(run: str, path: str, channel: Channel) -> str:
-    """Returns the key of a member's messages, e.g. `echelon/lab-7f3a/g1/r3/state`; the root's path is empty."""
+    """Returns the key of a member's messages on a channel, e.g. `echelon/lab-7f3a/g1/r3/state`; the root's path is empty."""
     return "/".join(chunk for chunk in ("echelon", run, path, channel.name.lower()) if chunk)
 
 
 def watch_key(run: str, role: str, name: str) -> str:
-    """Returns the key under which a member's messages go to those who watch a run, in batches (`join`); `role` and
-    `name` may be wildcards."""
+    """Returns the key under which copies of a member's messages are sent in batches (`join`) to the recorder and other
+    observers.  `role` and `name` may be wildcards."""
     return f"echelon/{run}/@watch/{role}/{name}"
 
 
 def token_key(run: str, role: str, name: str, boot_id: str) -> str:
-    """Returns a presence token: `echelon/<run>/@alive/<version>/<role>/<name>/<boot id>`, always of seven chunks."""
+    """Returns the key of a presence token: `echelon/<run>/@alive/<version>/<role>/<name>/<boot id>`, always seven chunks."""
     return f"echelon/{run}/@alive/{SCHEMA_VERSION}/{role}/{name.replace('/', '.')}/{boot_id}"

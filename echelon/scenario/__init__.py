@@ -1,1 +1,1 @@
-"""What a user writes: the tables of a scenario, as pydantic models."""
+"""The tables of a scenario file, as pydantic models."""

@@ -1,4 +1,4 @@
-"""The part of a scenario that concerns the CAN bus: drives, envelope, buses, and what happens on schedule."""
+"""The tables of a scenario that concern the CAN bus: drives, envelope, buses and scheduled events."""
 
 from typing import Annotated, Literal
 
@@ -24,105 +24,107 @@ from echelon.scenario.values import (
 
 
 class DriveTable(Table):
-    """The drives of a robot's wheels, and their motors; both wheels have the same."""
+    """The drives and motors of a robot's wheels.  Both wheels have the same values."""
 
     protocol: ProtocolField = None
     """`native` (one frame for both wheels, counter and CRC; the default), `odrive` (CANSimple 0.6), `cia402` (cyclic
     synchronous torque over CANopen), or your own"""
     node_ids: tuple[NodeId, NodeId] | None = None
-    """Of the right and the left wheel's drive; unless given, the lowest whose identifiers nobody on the bus uses"""
+    """Node ids of the right and the left wheel's drive; unless given, the lowest ids whose identifiers are free on the bus"""
     recover_after: Seconds | None = None
-    """How long after a fault the bridge clears it and enables the drive anew [s]; never unless given"""
+    """How long after a fault the bridge clears the fault and enables the drive again [s]; never unless given"""
     torque_limit: Constant | None = None
     """Largest torque of the motor [N m]; the robot's limit unless given"""
     rated_torque: Constant | None = None
-    """Torque that the motor can give for ever [N m], of which CiA 402 counts in thousandths; `torque_limit` unless given"""
+    """Torque that the motor can hold without time limit [N m]; CiA 402 states torques in thousandths of it; `torque_limit`
+    unless given"""
     torque_slew: Limit | None = None
-    """Largest change of torque [N m/s]; none unless given"""
+    """Largest rate of change of the torque [N m/s]; unlimited unless given"""
     lag: ConstantOrZero | None = None
-    """Time constant of the current loop [s]; 0 unless given: the torque follows at once"""
+    """Time constant of the current loop [s]; 0 unless given, which means that the torque follows at once"""
     torque_constant: Constant | None = None
-    """K_t [N m/A]; 0.1 unless given"""
+    """Torque constant K_t [N m/A]; 0.1 unless given"""
     resistance: ConstantOrZero | None = None
-    """Of the winding, which its current heats [Ω]; 0 unless given"""
+    """Resistance of the winding [Ω], which is heated by its current; 0 unless given"""
     thermal_resistance: Constant | None = None
-    """From winding to ambient [K/W]; 2 unless given"""
+    """Thermal resistance from winding to ambient [K/W]; 2 unless given"""
     thermal_time: Constant | None = None
     """Time constant of the winding's temperature [s]; 60 unless given"""
     ambient: Finite | None = None
     """Temperature around the motor [°C]; 25 unless given"""
     derating_from: Finite | None = None
-    """From this temperature on the torque limit falls [°C], linearly, to zero at `temperature_limit`; 80 unless given"""
+    """Winding temperature above which the torque limit falls [°C], linearly to zero at `temperature_limit`; 80 unless given"""
     temperature_limit: Finite | None = None
-    """From this temperature on there is an over-temperature fault [°C]; 100 unless given"""
+    """Winding temperature at which the drive raises an over-temperature fault [°C]; 100 unless given"""
     supply_voltage: Constant | None = None
-    """[V]; 24 unless given"""
+    """Supply voltage without load [V]; 24 unless given"""
     supply_resistance: ConstantOrZero | None = None
-    """Of battery and cables [Ω]; 0 unless given"""
+    """Resistance of battery and cables [Ω]; 0 unless given"""
     brown_out: ConstantOrZero | None = None
-    """Under this voltage the drive gives up [V]; 18 unless given"""
+    """Supply voltage below which the drive raises a brown-out fault [V]; 18 unless given"""
     encoder_counts: Annotated[int, Field(strict=True, ge=1, le=1 << 24)] | None = None
-    """Per revolution of the wheel; 4096 unless given"""
+    """Encoder counts per revolution of the wheel; 4096 unless given"""
     inertia: Constant | None = None
-    """Of a wheel on a bench, where no robot turns it (`echelon drives`) [kg m²]; 0.01 unless given"""
+    """Inertia of a wheel that turns freely on a bench, without a robot (`echelon drives`) [kg m²]; 0.01 unless given"""
     friction: ConstantOrZero | None = None
-    """Of that wheel [N m s/rad]; 0.01 unless given"""
+    """Viscous friction of a wheel on a bench [N m s/rad]; 0.01 unless given"""
 
 
 class EnvelopeTable(Table):
-    """The last gate before the bus: what it does not let pass becomes zero torque, and is counted."""
+    """The last gate before the bus.  A command that breaks one of these limits becomes zero torque and is counted."""
 
     torque_limit: Limit | None = None
     """Largest torque of a wheel [N m]; the robot's limit unless given"""
     rise_limit: Limit | None = None
-    """Largest growth of a torque's magnitude from frame to frame [N m]; none unless given"""
+    """Largest growth of a torque's magnitude from frame to frame [N m]; unlimited unless given"""
     fall_limit: Limit | None = None
-    """Largest decrease of a torque's magnitude from frame to frame [N m]; none unless given"""
+    """Largest decrease of a torque's magnitude from frame to frame [N m]; unlimited unless given"""
     window_limit: Limit | None = None
-    """Largest difference between two torques within 250 ms [N m]; none unless given"""
+    """Largest difference between two torques within 250 ms [N m]; unlimited unless given"""
     stale_after: Seconds | None = None
-    """Age from which on a robot's torque is not used any more [s]; `can.watchdog` unless given"""
+    """Largest age at which a robot's torque is still used [s]; `can.watchdog` unless given"""
 
 
 class Bus(Table):
     """One of several buses."""
 
     url: str | None = None
-    """Where it is; `can.url` unless given"""
+    """Address of the bus; `can.url` unless given"""
     bitrate: Bitrate | None = None
-    """[bit/s]; `can.bitrate` unless given"""
+    """Bit rate [bit/s]; `can.bitrate` unless given"""
 
 
 class Can(Table):
     """The CAN bus, or buses."""
 
     enabled: Flag = True
-    """False: there are no frames"""
+    """False: the run makes no CAN frames"""
     url: str = "auto"
-    """`socketcan:vcan0`, `udp_multicast:…`, `virtual`; `auto` takes vcan0 where it is up, else udp_multicast"""
+    """Address of the bus: `socketcan:vcan0`, `udp_multicast:…` or `virtual`; `auto` is vcan0 if it is up, else udp_multicast"""
     bitrate: Bitrate = 1_000_000
-    """[bit/s]"""
+    """Bit rate [bit/s]"""
     buses: dict[Name, Bus] = {}
-    """Several buses by name, each with a `url` and a `bitrate` of its own if need be; robots say theirs with `bus`"""
+    """Several buses by name; each may have its own `url` and `bitrate`.  A robot chooses its bus with the key `bus`"""
     torque_scale: Positive = 0.001
-    """Newton metres per bit where a frame has torques as whole numbers; ±32767 bits fit"""
+    """Torque per bit in frames that hold torques as whole numbers of 16 bits [N m]; the largest is 32767 bits"""
     path: Literal["mirror", "closed"] = "mirror"
-    """`mirror`: the plant takes the computed torque, the bus shows it.  `closed`: the plant takes what the drives report,
-    which is what they decoded from the frames"""
+    """`mirror`: the plant takes the computed torques, and the bus only shows them.  `closed`: the plant takes the torques that
+    the drives report, and the drives take theirs from the frames"""
     timing: Literal["bits", "ideal"] | None = None
-    """How long frames take on the closed path: as on a real bus (`bits`), or no time at all (`ideal`).  In virtual time `bits`
-    unless given; on a wall clock a bus takes its own time unless `bits` is given, which makes a virtual one as slow as a
-    real one"""
+    """How long a frame takes on the closed path: as long as on a real bus (`bits`), or no time at all (`ideal`).  In virtual
+    time the default is `bits`.  On a wall clock a bus takes its own time unless `bits` is given; then a virtual bus is as slow
+    as a real one"""
     virtual_drives: Flag = True
-    """On the closed path: False leaves the bus to drives that are there already (wall clock only)"""
+    """False: the closed path uses real drives that are on the bus already, not virtual ones (wall clock only)"""
     watchdog: Seconds = 0.1
-    """A drive that hears no command for this time, and a bridge that hears no robot, take the torque away [s]"""
+    """The torque is taken away after this time without news [s]: by a drive that receives no command, and by the bridge if a
+    robot sends nothing"""
     bring_up: Seconds = 1.0
     """How long before run time 0 the bridge begins to enable the drives [s]"""
     queue: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 256
-    """Frames that may wait to be sent, in the bridge and in each drive, before further ones are lost"""
+    """How many frames the bridge, and each drive, can hold while they wait for the bus; further frames are lost"""
     restart: SecondsOrZero = 0.1
-    """How long a controller that went bus-off waits before it tries to come back [s]"""
+    """How long a CAN controller waits after it went bus-off before it begins to come back [s]"""
 
     @model_validator(mode="after")
     def _names(self) -> "Can":
@@ -132,62 +134,66 @@ class Can(Table):
 
 
 class DriveFault(Table):
-    """A fault of a drive."""
+    """A fault of drives."""
 
     kind: Literal["drive_fault"]
-    """Something breaks in a drive"""
+    """Kind of this event"""
     at: SecondsOrZero
-    """When it begins [s of run time]"""
+    """When the fault begins [s of run time]"""
     duration: Seconds | None = None
-    """Until its cause goes away [s]; never unless given.  What it latched stays latched until it is cleared"""
+    """How long the cause of the fault lasts [s]; for ever unless given.  A fault that a drive has latched stays until it is
+    cleared, also after its cause is gone"""
     robot: str = "**"
-    """Whose drives: a path in the tree, which may hold `*` and `**`"""
+    """The robots whose drives have the fault: a path in the tree, which may hold `*` and `**`"""
     wheel: Literal["right", "left", "both"] = "both"
-    """Which of its wheels"""
+    """The wheels whose drives have the fault"""
     fault: Literal["over_temperature", "encoder_loss", "brown_out", "stuck_torque", "silent"]
-    """What breaks"""
+    """The fault: the winding is too hot, the encoder fails, the supply voltage is too low, the torque stays as it is, or the
+    drive sends nothing"""
 
 
 class Estop(Table):
-    """Emergency stop, each protocol's own: drives take the torque away by themselves and stay disabled, for good unless it has
-    a `duration`."""
+    """An emergency stop.  The drives take the torque away by themselves, each as its protocol prescribes.  They stay disabled
+    for ever unless `duration` is given."""
 
     kind: Literal["estop"]
-    """Somebody presses the button"""
+    """Kind of this event"""
     at: SecondsOrZero
-    """When [s of run time]"""
+    """When the button is pressed [s of run time]"""
     duration: Seconds | None = None
     """How long the button stays pressed [s]; for ever unless given"""
     robot: str = "**"
-    """Whose drives: a path in the tree, which may hold `*` and `**`"""
+    """The robots that stop: a path in the tree, which may hold `*` and `**`"""
 
 
 class ErrorFrames(Table):
-    """Disturbances on a bus: each attempt to send a frame is destroyed with a probability, and repeated (timing `bits`)."""
+    """A disturbance of a bus.  Attempts to send a frame are destroyed at random, and the frame is sent again (needs the timing
+    `bits`)."""
 
     kind: Literal["error_frames"]
-    """A bus is disturbed"""
+    """Kind of this event"""
     at: SecondsOrZero
-    """When it begins [s of run time]"""
+    """When the disturbance begins [s of run time]"""
     duration: Seconds | None = None
-    """How long it lasts [s]; for ever unless given"""
+    """How long the disturbance lasts [s]; for ever unless given"""
     bus: Name | None = None
-    """Which bus; all unless given"""
+    """The disturbed bus; all buses unless given"""
     rate: Fraction
     """Probability that an attempt to send a frame is destroyed"""
 
 
 class BusOff(Table):
-    """A CAN controller goes bus-off, and comes back after `can.restart` and 128 times 11 idle bits (timing `bits`)."""
+    """CAN controllers go bus-off.  They come back after `can.restart` and 128 times 11 idle bits (needs the timing `bits`)."""
 
     kind: Literal["bus_off"]
-    """A controller leaves the bus"""
+    """Kind of this event"""
     at: SecondsOrZero
-    """When [s of run time]"""
+    """When the controllers go bus-off [s of run time]"""
     bus: Name | None = None
-    """Which bus; all unless given"""
+    """The bus of the controllers; all buses unless given"""
     robot: str | None = None
-    """Whose drives' controllers; the bridge's unless given"""
+    """The robots whose drives go bus-off: a path in the tree, which may hold `*` and `**`; unless given, the bridge goes
+    bus-off"""
 
 
 Event = Annotated[DriveFault | Estop | ErrorFrames | BusOff, Field(discriminator="kind")]

@@ -1,13 +1,13 @@
-"""How a scenario writes a part (echelon.plugins), as types for the fields of its tables.
+"""Types for fields of a scenario's tables that hold a part (echelon.plugins), and the ways in which a scenario writes one:
 
     trajectory = { kind = "circle", radius = 2.0, rate = 0.1 }                       by name, parameters beside it
-    trajectory = { use = "my_paths.py:Spiral", parameters = { rate = 0.2 } }         the same for any part
+    trajectory = { use = "my_paths.py:Spiral", parameters = { rate = 0.2 } }         parameters in a table of their own
     robot.model = "rigid_body"                                                       by name alone
     robot.model = { use = "my_plants.py:Slipping", parameters = { slip = 0.1 } }
-    law = { use = "my_laws.py:Relay", parameters = { gain = 2.0 }, epsilon = [0.5] }   beside keys of the table itself
+    law = { use = "my_laws.py:Relay", parameters = { gain = 2.0 }, epsilon = [0.5] }   in a table that has other keys, too
     robot.drive.protocol = "odrive"
 
-Validation needs a `PartContext`: the registry that parts are looked up in, and the folder that files are relative to.
+Validation needs a `PartContext`: the registry in which parts are looked up, and the folder to which files are relative.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -22,20 +22,22 @@ KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"
 _NO_CONTEXT: Final = "a scenario with parts is validated with a PartContext (echelon.sim.parts.loading.load)"
 PART: Final = "part"
-"""Key in the JSON schema of a field of this kind; its value is the group of the parts (see echelon.scenario.schema)"""
+"""Key in the JSON schema of a field that holds a part; its value is the group of the part (see echelon.scenario.schema)"""
 BESIDE: Final = "beside"
-"""Key in the same place; True: parameters are written beside the part's name; None: in a key of their own"""
+"""Key in the same JSON schema.  True: the parameters stand beside the part's name.  False: the name stands alone, or in a table
+with `use` and `parameters`.  None: the parameters are another field of the table"""
 
 
 class PartContext(NamedTuple):
-    """What pydantic is given as context when it validates a scenario."""
+    """The validation context that pydantic needs for a scenario: where parts are found."""
 
     registry: Registry
     folder: Path
 
 
 def make_part(group: str, use: Any, parameters: Any, context: PartContext | None) -> Part[Any]:
-    """Returns the part that a scenario describes.  Raises PartError, whose keys are `use` or `parameters`."""
+    """Returns the part that a scenario describes.  Raises PartError with the key that is wrong, `use` or `parameters`; raises
+    TypeError without a context."""
     if context is None:
         raise TypeError(_NO_CONTEXT)
     if not isinstance(parameters, Mapping):
@@ -58,14 +60,15 @@ def _table(group: str, value: Mapping[str, Any], context: PartContext | None) ->
 
 
 def _beside(mistake: PartError, *name: str) -> PartError:
-    """Returns a mistake where the part is called by `name` and parameters stand beside that, not in a table of their own."""
+    """Returns a mistake of `make_part` with the keys of a field whose key for the part is `name` and whose parameters stand
+    beside that key, not in a table of their own."""
     if mistake.keys == ("use",):
         return mistake.at(*name, shown=mistake.shown)
     return mistake.at(*mistake.keys[1:], shown=mistake.shown)
 
 
 def _inline(group: str) -> Callable[[Any, ValidationInfo], Part[Any]]:
-    """Returns the validator of a table that says its `kind` beside its parameters, or `use` and `parameters`."""
+    """Returns the validator of a table with `kind` and the parameters beside it, or with `use` and `parameters`."""
 
     def validate(value: Any, info: ValidationInfo) -> Part[Any]:
         if isinstance(value, Part):
@@ -88,7 +91,7 @@ def _inline(group: str) -> Callable[[Any, ValidationInfo], Part[Any]]:
 
 
 def _by_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
-    """Returns the validator of a name, or of a table with `use` and `parameters`."""
+    """Returns the validator of a part's name, or of a table with `use` and `parameters`."""
 
     def validate(value: Any, info: ValidationInfo) -> Part[Any] | None:
         if value is None or isinstance(value, Part):
@@ -104,8 +107,9 @@ def _by_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
 
 
 def written_use(part: Part[Any], info: SerializationInfo) -> str:
-    """Returns how a scenario is to name a part: as it does, but for files that the context of pydantic, a mapping of sources,
-    gives other names to."""
+    """Returns the name of a part for a scenario that is written out.
+
+    The context of pydantic may map files to other names; a part in such a file is named with the other name."""
     names: Mapping[Source, str] = info.context or {}
     if part.source is not None and part.source in names:
         return f"{names[part.source]}:{part.use.rpartition(':')[2]}"
@@ -126,7 +130,7 @@ def _written_by_name(part: Part[Any] | None, info: SerializationInfo) -> Any:
 
 
 def parts_in(value: Any) -> Iterator[Part[Any]]:
-    """Yields all parts in a scenario, or in a value of one, in their order."""
+    """Yields all parts in a scenario, or in a value of a scenario, in the order of the fields."""
     if isinstance(value, Part):
         yield value
     elif isinstance(value, BaseModel):
@@ -138,7 +142,7 @@ def parts_in(value: Any) -> Iterator[Part[Any]]:
 
 
 def _named(group: str) -> Callable[[Any, ValidationInfo], str]:
-    """Returns the validator of a name whose parameters stand in the field `parameters` beside it."""
+    """Returns the validator of a part's name in the field `use` of a table that has its parameters in another field."""
 
     def validate(value: Any, info: ValidationInfo) -> str:
         context: PartContext | None = info.context
@@ -156,12 +160,12 @@ def _named(group: str) -> Callable[[Any, ValidationInfo], str]:
 
 
 def _beside_name(group: str) -> Callable[[Any, ValidationInfo], Part[Any] | None]:
-    """Returns the validator of the parameters of a part whose name stands in the field `use` before them."""
+    """Returns the validator of the parameters of a part.  The field `use` of the same table, validated before, has its name."""
 
     def validate(value: Any, info: ValidationInfo) -> Part[Any] | None:
         if isinstance(value, Part):
             return value
-        if "use" not in info.data:  # what is wrong there is said already
+        if "use" not in info.data:  # `use` is wrong, and that mistake is reported already
             return None
         try:
             return make_part(group, info.data["use"], value, info.context)

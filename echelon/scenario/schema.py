@@ -1,17 +1,16 @@
-"""The scenario's keys for editors (a JSON schema) and for people (a page of Markdown), from the tables themselves.
+"""The keys of a scenario as a JSON schema for editors and as a page of Markdown for people, made from the tables.
 
-A key's description is the docstring below it.  Those are read from the source when somebody asks: pydantic could do it
-(`use_attribute_docstrings`), but for every table of every run, which makes each start 30 ms longer.
+The description of a key is the docstring below its field.  It is read from the source only when a schema is made: with
+pydantic's `use_attribute_docstrings` it would be read for every table of every run, and each start would take 30 ms longer.
 """
 
-import ast
-import inspect
 import json
 from collections.abc import Iterator
 from typing import Any, Final
 
 from pydantic import BaseModel
 
+from echelon.docstrings import field_docstrings
 from echelon.plugins import Plugin, Registry
 from echelon.scenario.part_fields import BESIDE, KIND, PART
 from echelon.scenario.tables import Scenario
@@ -26,17 +25,17 @@ _USE: Final[Schema] = {
     "properties": {
         "use": {
             "type": "string",
-            "description": "One that is built in or installed, or `file.py:Class`, the file relative to the scenario's",
+            "description": "Name of a built-in or installed part, or `file.py:Class`, a file relative to the scenario",
         },
-        "parameters": {"type": "object", "description": "What the part's class says"},
+        "parameters": {"type": "object", "description": "Parameters of the part: the fields of its class"},
     },
     "required": ["use"],
     "additionalProperties": False,
 }
 WITH_KIND: Final = "trajectories"
-"""Parts whose name is the `kind` of a table, with their parameters beside it"""
-WRITTEN: Final = {"laws": "law.use", "plants": "robot.model.use", "protocols": "robot.drive.protocol.use"}
-"""Where the other parts are named"""
+"""The group whose parts are written as a table with the name as `kind` and the parameters beside it"""
+USE_KEYS: Final = {"laws": "law.use", "plants": "robot.model.use", "protocols": "robot.drive.protocol.use"}
+"""The keys that hold the names of parts of the other groups"""
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 HEAD: Final = """\
 # Scenario files
@@ -51,15 +50,15 @@ A part of your own (a trajectory, a plant) is a class in a Python file beside th
 
 
 def scenario_schema(registry: Registry) -> Schema:
-    """Returns the JSON schema of scenario files, with the docstring of each key as its description; parts that are built in are
+    """Returns the JSON schema of scenario files.  The description of a key is the docstring of its field; built-in parts are
     those of `registry`."""
     schema = Scenario.model_json_schema(mode="serialization")
     schema["$defs"] |= {USE: _USE}
-    docs = {model.__name__: _docstrings(model) for model in _tables(Table)}
+    docs = {model.__name__: field_docstrings(model) for model in _tables(Table)}
     docs[USE] = {key: value["description"] for key, value in _USE["properties"].items()}
     for group, name, part in _built_in(registry):
         schema["$defs"][part.__name__] = _part(group, name, part)
-        docs[part.__name__] = {KIND: f"`{name}`"} | _docstrings(part)
+        docs[part.__name__] = {KIND: f"`{name}`"} | field_docstrings(part)
     schema = _plain(_with_parts(schema, registry))
     schema["$defs"]["Law"]["allOf"] = [
         {
@@ -76,7 +75,9 @@ def scenario_schema(registry: Registry) -> Schema:
 
 
 def _built_in(registry: Registry) -> Iterator[tuple[str, str, type[Plugin]]]:
-    """Yields the parts that are built in and have parameters, or else their `kind`, to write: group, name, class."""
+    """Yields group, name and class of the built-in parts that need a table of their own in the schema.
+
+    These are all laws, all parts that are written with their `kind`, and all other parts that have parameters."""
     for group in registry.groups.values():
         for name, part in group.built_in.items():
             if part.model_fields or group.name in (WITH_KIND, "laws"):
@@ -84,7 +85,7 @@ def _built_in(registry: Registry) -> Iterator[tuple[str, str, type[Plugin]]]:
 
 
 def _part(group: str, name: str, part: type[Plugin]) -> Schema:
-    """Returns the table of the parameters of a part that is built in, with its `kind` where that stands beside them."""
+    """Returns the schema of a built-in part's parameters, with the key `kind` if its group is written with it."""
     table = part.model_json_schema()
     assert "$defs" not in table, "parameters of parts are plain values"
     if group != WITH_KIND:
@@ -94,7 +95,7 @@ def _part(group: str, name: str, part: type[Plugin]) -> Schema:
 
 
 def _with_parts(schema: Any, registry: Registry) -> Any:
-    """Returns a schema with what may be written in the place of each part."""
+    """Returns a schema in which each field that holds a part lists what may be written there."""
     if isinstance(schema, list):
         return [_with_parts(part, registry) for part in schema]
     if not isinstance(schema, dict):
@@ -102,7 +103,7 @@ def _with_parts(schema: Any, registry: Registry) -> Any:
     if PART not in schema:
         return {key: _with_parts(value, registry) for key, value in schema.items()}
     built_in, use = registry.groups[schema[PART]].built_in, {"$ref": f"#/$defs/{USE}"}
-    other = {"type": "string", "not": {"enum": list(built_in)}}  # an installed one, which may take any parameters
+    other = {"type": "string", "not": {"enum": list(built_in)}}  # an installed part, which may take any parameters
     if schema[BESIDE] is None:
         return {"oneOf": [{"enum": list(built_in)}, other]}
     if schema[BESIDE]:
@@ -112,7 +113,7 @@ def _with_parts(schema: Any, registry: Registry) -> Any:
 
 
 def reference_page(registry: Registry) -> str:
-    """Returns a page with a section for each table of a scenario: where it stands, its keys, their values and defaults."""
+    """Returns a Markdown page with a section for each table of a scenario: its place, its keys, their values and defaults."""
     schema = scenario_schema(registry)
     sections = []
     for name, places in _places(schema).items():
@@ -124,7 +125,7 @@ def reference_page(registry: Registry) -> str:
     for group, name, part in _built_in(registry):
         if group != WITH_KIND and part.model_fields:
             table = schema["$defs"][part.__name__]
-            where = f"`parameters` of `{WRITTEN[group]} = {json.dumps(name)}`"
+            where = f"`parameters` of `{USE_KEYS[group]} = {json.dumps(name)}`"
             sections.append(f"## {where}\n\n{_text(table['description'])}\n\n{_rows(table)}")
     return HEAD + "\n".join(sections)
 
@@ -135,28 +136,16 @@ def _tables(table: type[BaseModel]) -> Iterator[type[BaseModel]]:
         yield from _tables(model)
 
 
-def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Returns the docstrings below the attributes of a class."""
-    (tree,) = ast.parse(inspect.getsource(model)).body
-    assert isinstance(tree, ast.ClassDef)
-    found = {}
-    for statement, below in zip(tree.body, tree.body[1:], strict=False):
-        match statement, below:
-            case ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text))):
-                found[key] = " ".join(text.split())
-    return found
-
-
 def _plain(schema: Any) -> Any:
-    """Returns a schema without what says nothing in TOML: null, which it does not have, titles, which repeat keys, and
-    defaults of tables, whose keys have their own."""
+    """Returns a schema without entries that mean nothing in TOML: null, which TOML does not have; titles, which repeat the
+    keys; and defaults of tables, because their keys have defaults."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):
         return schema
     if "anyOf" in schema:
         one, *others = [part for part in schema["anyOf"] if part.get("type") != "null"]
-        assert not others, "no key takes several kinds that are not told apart"
+        assert not others, "a key with several types needs tags"
         schema = {key: value for key, value in schema.items() if key not in ("anyOf", "default")} | one
     if "patternProperties" in schema:
         schema = schema | {"additionalProperties": False}
@@ -169,7 +158,7 @@ def _plain(schema: Any) -> Any:
 
 
 def _places(schema: Schema) -> dict[str, list[str]]:
-    """Returns the tables, each followed by those in it, with all places where each may stand."""
+    """Returns for each table all places in a scenario where it may stand; a table comes before the tables in it."""
     places: dict[str, list[str]] = {Scenario.__name__: []}
 
     def walk(place: str, table: Schema) -> None:
@@ -186,7 +175,7 @@ def _places(schema: Schema) -> dict[str, list[str]]:
 
 
 def _references(value: Schema) -> Iterator[tuple[str, str]]:
-    """Yields the tables that a value may be, with what stands behind the key then."""
+    """Yields the tables that a value may be: the suffix of the key in each case, and the name of the table."""
     if "$ref" in value:
         yield "", value["$ref"].rpartition("/")[2]
     for part in value.get("oneOf", ()):
@@ -214,7 +203,7 @@ def _literal(value: Any) -> str:
 
 
 def _values(value: Schema) -> str:
-    """Returns in words what a key may be."""
+    """Returns a description in words of the values that a schema allows."""
     if "const" in value:
         return _literal(value["const"])
     if "enum" in value:

@@ -1,8 +1,8 @@
-"""The scenario: what a user writes, as pydantic models.  Every key is known, every value has a range and SI units.
+"""The tables of a scenario file (TOML) as pydantic models.  Unknown keys are refused; every value has a range and a unit.
 
-A file is TOML.  Robots inherit in three levels: `[robot]` for all, `robot` of a group (and of the groups around it),
-then the robot itself.  Reading, overriding and explaining mistakes is in `echelon.planning.loading`; the plan that
-roles work with is made in `echelon.planning.plan_maker`; what concerns the CAN bus stands in `echelon.scenario.can_tables`.
+A robot's values come from three levels: `[robot]` for all robots, `robot` of its group and of the groups around that, and the
+robot's own table.  `echelon.planning.loading` reads files, applies overrides and explains mistakes;
+`echelon.planning.plan_maker` makes the plan that roles work with; `echelon.scenario.can_tables` has the tables of the CAN bus.
 """
 
 from typing import Annotated, Literal
@@ -37,77 +37,78 @@ from echelon.scenario.values import number_or_table as _number_or_table
 
 ChannelName = Literal["state", "group_state", "reference", "command", "torque", "*"]
 BLOCK_NAMES = ("intra", "middle", "inter", "centroid")
-"""Names of blocks and layers of blocks, which groups therefore cannot have."""
+"""Names of blocks and of layers of blocks.  Groups cannot have these names."""
 
 
 RESERVED_NAMES = ("coordinator", "bridge", "drives", "recorder", "referee")
-"""Names of processes, which robots and groups therefore cannot have."""
+"""Names of processes.  Robots and groups cannot have these names."""
 
 
 class Periods(Table):
-    """How often things happen."""
+    """The periods of the run."""
 
     acceleration: Positive = 0.01
-    """Between two accelerations of every node and robot [s], unless a group has a `period` of its own"""
+    """Acceleration period: the time for which accelerations are held [s], of all nodes that have no `period` of their own"""
     torque: Positive = 0.01
-    """Between two torques of a robot [s]; divides `acceleration`"""
+    """Torque period: the time for which wheel torques are held [s]; it must divide `acceleration`"""
 
 
 class RobotTable(Table):
-    """A robot, or what all robots of a level have in common.
+    """A robot, or values that all robots of a level share.
 
-    Each key is taken from the robot itself, else from its group's `robot`, else from the groups around it, else from
-    `[robot]`."""
+    Each key is taken from the robot's own table, else from `robot` of its group, else from `robot` of the groups around that,
+    else from `[robot]`.  The symbols are those of docs/architecture.md, 2.1."""
 
     model: PlantField = None
-    """Plant: `paper` (the paper's equations, the default), `rigid_body` (its mass at the reference point), `hill` (with a load,
-    on a slope), or your own"""
+    """Plant: `paper` (the paper's equations, the default), `rigid_body` (its mass is at the reference point), `hill` (with a
+    load, on a slope), or your own"""
     mass: Positive | None = None
-    """m1 [kg]; must be given on some level"""
+    """m1, mass [kg]; must be given on some level"""
     inertia: Positive | None = None
-    """I [kg m²], larger than mass·offset²; must be given on some level"""
+    """I, moment of inertia [kg m²], larger than mass·offset²; must be given on some level"""
     wheel_radius: Positive | None = None
-    """r [m]; must be given on some level"""
+    """r, wheel radius [m]; must be given on some level"""
     arm: Positive | None = None
-    """R, lever arm of a wheel about the robot's middle: half the track [m]; must be given on some level"""
+    """R, lever arm of a wheel about the middle of the axle: half the track [m]; must be given on some level"""
     offset: Finite | None = None
-    """d, from the axle to the reference point [m]; not zero, and must be given on some level"""
+    """d, distance from the axle to the reference point [m], positive in front; not zero; must be given on some level"""
     start: Point | None = None
-    """Position of the reference point at the start [m]; must be given.  The robot is at rest"""
+    """Position of the reference point at the start [m]; must be given.  The robot starts at rest"""
     heading: Finite | None = None
-    """θ at the start, counter-clockwise from the x axis, in radians [rad]; 0 unless given"""
+    """θ, heading at the start, counter-clockwise from the x axis [rad]; 0 unless given"""
     torque_limit: Limit | None = None
-    """Largest torque of a wheel [N m]; none unless given"""
+    """Largest torque of a wheel [N m]; unlimited unless given"""
     torque_rate_limit: Limit | None = None
-    """Largest change of a wheel's torque [N m/s]; none unless given"""
+    """Largest rate of change of a wheel's torque [N m/s]; unlimited unless given"""
     wheel_speed_limit: Limit | None = None
-    """Wheel speed beyond which the motor gives no torque in the direction of motion [rad/s]; none unless given"""
+    """Wheel speed beyond which the motor gives no torque in the direction of motion [rad/s]; unlimited unless given"""
     bus: Name | None = None
-    """Which of `can.buses` its drives are on; the first one unless given"""
+    """The bus of its drives, one of `can.buses`; the first one unless given"""
     drive: DriveTable | None = None
     """The drives of its wheels"""
     envelope: EnvelopeTable | None = None
-    """What the bridge lets pass to its drives"""
+    """Limits of the torque commands that the bridge sends to its drives"""
 
 
 class Shape(Table):
-    """Desired shape of a group: where its robots, or the centroids of its groups, are to be about each other."""
+    """Desired shape of a group: the desired places of its children relative to each other.  A child group's place is its
+    centroid."""
 
     kind: Literal["triangle", "polygon", "line", "column", "wedge", "points", "vectors"]
-    """`triangle` and `polygon` need `side`; `line` (side by side for travel along x), `column` (one behind the other) and
-    `wedge` (a V open to the rear) need `spacing`; or the `points` themselves, or the shape variables as `vectors`"""
+    """`triangle` and `polygon` need `side`.  `line` (side by side for travel along x), `column` (one behind the other) and
+    `wedge` (a V open to the rear) need `spacing`.  `points` and `vectors` need the key of the same name"""
     side: Positive | None = None
-    """Between neighbours of a triangle or polygon [m]"""
+    """Distance between neighbours of a triangle or polygon [m]"""
     spacing: Positive | None = None
-    """Between neighbours of a line, column or wedge [m]"""
+    """Distance between neighbours of a line, column or wedge [m]"""
     angle: Annotated[float, Field(strict=True, gt=0, lt=180)] = 90.0
-    """Between the arms of a wedge, in degrees [°]"""
+    """Angle between the arms of a wedge [°]"""
     rotation: Finite = 0.0
-    """Turns the shape counter-clockwise, in degrees [°]"""
+    """Angle by which the shape is turned counter-clockwise [°]"""
     points: list[Point] | None = None
-    """One for each child, in their order [m]; only where they are to each other matters"""
+    """A position for each child, in their order [m]; only the differences between positions matter"""
     vectors: list[Point] | None = None
-    """The shape variables, one fewer than there are children [m]"""
+    """The shape variables (docs/architecture.md, 2.3), one fewer than there are children [m]"""
 
     @model_validator(mode="after")
     def _complete(self) -> "Shape":
@@ -122,18 +123,19 @@ class Shape(Table):
 
 
 class Group(Table):
-    """A node of the tree: its children are robots, groups, or both; their order is that of the file."""
+    """A node of the tree.  Its children are robots, groups, or both: first the robots, then the groups, each in the order of
+    the file."""
 
     shape: Shape | None = None
-    """Desired shape of its children; may be left out for a single child"""
+    """Desired shape of its children; needed if it has several"""
     robot: RobotTable = RobotTable()
-    """What the robots below it have in common"""
+    """Values that all robots below it share"""
     robots: dict[Name, RobotTable] = {}
     """Its robots by name"""
     groups: dict[Name, "Group"] = {}
-    """The groups below it by name"""
+    """Its child groups by name"""
     period: Positive | None = None
-    """Between two accelerations of this node [s]; `periods.acceleration` unless given; a multiple of its children's"""
+    """Acceleration period of this node [s]: a multiple of its child groups' periods; `periods.acceleration` unless given"""
 
     @model_validator(mode="after")
     def _children(self) -> "Group":
@@ -153,45 +155,47 @@ class Group(Table):
 
 
 class Gains(Table):
-    """Gains before division by the time scale: K_1 = k1/σ², K_2 = k2/σ; a number, or a full matrix of the block."""
+    """Gains of blocks before division by their time scale σ: K_1 = k1/σ², K_2 = k2/σ (docs/architecture.md, 2.4)."""
 
     block: str = "*"
-    """Which blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
+    """The blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
     k1: Gain = 1.0
-    """Of the error"""
+    """Gain of the error: a number, or a full matrix of the block"""
     k2: Gain = 1.0
-    """Of the error's rate"""
+    """Gain of the error's rate: a number, or a full matrix of the block"""
 
 
 class Coupling(Table):
-    """Velocity coupling K̄ of one pair of blocks: a number for every entry, or the full matrix."""
+    """Velocity coupling K̄: the error rates of one block act on another block (docs/architecture.md, 2.4)."""
 
     block: str = "*"
-    """Which blocks are acted on: a name, a layer, or `*`"""
+    """The blocks that are acted on: a name, a layer, or `*`"""
     onto: str = "*"
-    """The blocks whose error rates act on them"""
+    """The blocks whose error rates act: a name, a layer, or `*`"""
     value: CouplingGain
-    """A number for every entry, or the full matrix"""
+    """Entries of K̄ for each pair of these blocks: a number for every entry, or the full matrix"""
 
 
 class Law(Table):
-    """The control law: time scales, gains and coupling of the blocks (the groups' shapes, the formation's, the centroid)."""
+    """The control law: time scales, gains and coupling of the blocks.  The blocks are the shapes of all nodes and the centroid
+    (docs/architecture.md, 2.4)."""
 
     use: LawName = Field(default="linear", validate_default=True)
     """`linear` (the paper's), `integral`, `terminal_sliding`, or a law of your own (docs/add-a-law.md)"""
     parameters: LawParameters = Field(default_factory=dict, validate_default=True)
-    """Of the law that `use` names"""  # validated, they are the law itself, a Part
+    """Parameters of the law that `use` names"""  # validation turns them into the law itself, a Part
     time_scales: Literal["three", "multi"] = "three"
-    """`three`: one per layer of the tree; `multi`: one per block, groups settling in their order"""
+    """`three`: one time scale for each layer of the tree.  `multi`: one for each node; the groups settle in their order"""
     epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
-    """ε1, ε2, …: each block's σ is a product of the first ones; as many as the tree has layers, or with `multi` groups
-    and the formation"""
+    """ε_1, ε_2, …: the time scale σ of a block is the product of the first few.  `three` needs as many as the tree has layers
+    of nodes, `multi` as many as there are nodes: the groups and the formation"""
     gains: list[Gains] = []
-    """K_1 and K_2 of blocks, for laws that use them; later entries override earlier ones"""
+    """Gains of blocks, for laws that use them; later entries override earlier ones"""
     coupling: list[Coupling] = []
-    """Coupling of blocks; later entries override earlier ones, and without any there is none"""
+    """Coupling of blocks; later entries override earlier ones.  Without entries no block is coupled"""
     lead: Fraction = 0.0
-    """How far ahead the law looks, in periods, for laws that do: 0 is the law as it stands, 0.5 makes up for the hold"""
+    """λ, how far ahead the law looks, in acceleration periods, for laws that use it (docs/architecture.md, 2.5).  With 0 the
+    law does not look ahead; 0.5 compensates for the hold of the accelerations"""
 
     @field_serializer("use")
     def _use(self, use: str, info: SerializationInfo) -> WrittenLawName:
@@ -199,16 +203,17 @@ class Law(Table):
 
 
 class Avoidance(Table):
-    """Collision avoidance: a potential pushes robots apart that are closer than `sensing_radius`."""
+    """Collision avoidance: a potential pushes robots apart that are closer than `sensing_radius` (docs/architecture.md,
+    2.6)."""
 
     enabled: Flag = False
-    """False: robots do not avoid each other, but distances below `avoidance_radius` are still violations"""
+    """False: robots do not avoid each other; a distance of at most `avoidance_radius` is still a violation"""
     avoidance_radius: Positive = 0.25
-    """r_a: closer than this, two robots are a violation [m]"""
+    """r_a: a distance of two robots of at most this is a violation [m]"""
     sensing_radius: Positive = 1.0
-    """R_s: closer than this, two robots push each other apart [m]"""
+    """R_s: two robots push each other apart if their distance is below this [m]"""
     force_limit: Positive = 1e4
-    """Cap of one pair's ∇f [m/s²], also inside r_a, where the potential is not defined"""
+    """Largest ∇f of one pair [m/s²]; it acts also within r_a, where the potential is not defined"""
 
     @model_validator(mode="after")
     def _radii(self) -> "Avoidance":
@@ -220,12 +225,12 @@ class Avoidance(Table):
 
 
 class Uniform(Table):
-    """Any delay between two bounds, all equally likely."""
+    """A random delay, uniform between two bounds."""
 
     min: NonNegative
-    """[s]"""
+    """Shortest delay [s]"""
     max: NonNegative
-    """[s]"""
+    """Longest delay [s]"""
 
     @model_validator(mode="after")
     def _bounds(self) -> "Uniform":
@@ -240,49 +245,50 @@ Delay = Annotated[
 
 
 class LinkRule(Table):
-    """What links are like.  The last rule that fits a link holds, and only that one."""
+    """Delay and loss of links.  For each link the last rule that fits it holds, and only that one."""
 
     source: str = "**"
-    """Who sends: a path in the tree (`g1/r2`) or `coordinator`; `*` stands for one chunk of a path, `**` for any number"""
+    """The sender: a path in the tree (`g1/r2`) or `coordinator`; `*` stands for one chunk of a path, `**` for any number"""
     receiver: str = "**"
-    """Who receives, in the same way"""
+    """The receiver, written as `source`"""
     channel: ChannelName = "*"
-    """What is sent; `*` stands for all"""
+    """The channel; `*` stands for all channels"""
     delay: Delay = 0.0
-    """How long a message takes [s]: a number, or a table of two bounds.  It is used at the first tick at
-    which it has come"""
+    """How long a message takes [s]: a number, or a table of two bounds.  A receiver uses the message at its first instant at or
+    after the arrival"""
     loss: Fraction = 0.0
-    """Probability that a message is lost, independent of all others"""
+    """Probability that a message is lost, independent of all other messages"""
     policy: Literal["hold", "hold_then_stop"] | None = None
-    """What a receiver uses if nothing newer has come: the last message that came, for ever (`hold`) or until it is older
-    than `timeout` (`hold_then_stop`).  Unless given: `hold` where torque is mirrored, `hold_then_stop` where the torque
-    path is closed"""
+    """What a receiver uses when nothing newer has come: the last message that came, for ever (`hold`) or until it is older
+    than `timeout` (`hold_then_stop`).  Unless given: `hold` if torque is mirrored, `hold_then_stop` if the torque path is
+    closed"""
     timeout: Seconds | None = None
-    """Age from which on a message is not used any more, for `hold_then_stop` [s]; `can.watchdog` unless given"""
+    """Age above which a message is not used any more, for `hold_then_stop` [s]; unless given, `can.watchdog`, or two periods of
+    the link if that is longer"""
 
 
 class Record(Table):
     """The recording."""
 
     display_period: Positive = 0.02
-    """Between transforms, markers, odometry and joint states [s of run time], at least the period of accelerations;
-    of states all are recorded"""
+    """Time between two transforms, markers, odometry messages and joint states of a robot [s of run time], at least
+    `periods.acceleration`; states are all recorded"""
 
 
 class Claim(Table):
-    """What the run is expected to show; the verdict fails if it does not."""
+    """A claim: errors that settle by a given time.  A claim that fails fails the verdict of the run."""
 
     block: str
-    """Which blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
+    """The blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
     settled_by: Positive
-    """When its error is to be settled [s of run time]"""
+    """The time by which the error of each of these blocks settles [s of run time]"""
     band: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.05
-    """Settled means: stays within this fraction of the error that the block starts with, to the end of the run.  That is its
-    largest error within the first 3 σ/√k1 (k1: the smallest gain of its error); a block that starts within `health.floor` must
-    stay there"""
+    """An error is settled if it stays within this fraction of the block's error at the start, to the end of the run.  The error
+    at the start is the largest error within the first 3 σ/√k1, where k1 is the smallest gain of the block's error.  A block
+    that starts within `health.floor` must stay there"""
     dwell: NonNegative | None = None
-    """For how long, at least, it must stay there until the run ends, in multiples of the block's time scale σ; `health.dwell`
-    unless given"""
+    """How long the error must at least stay in its band before the run ends, in multiples of the block's time scale σ;
+    `health.dwell` unless given"""
 
 
 CheckName = Literal[
@@ -304,66 +310,66 @@ CheckName = Literal[
 
 
 class Health(Table):
-    """The checks that every run is put to, whatever it claims.
+    """Checks of every run, whatever it claims.  A check that fails fails the verdict.
 
     `whole`: the run reaches its end.  `finite`: all states are finite numbers.  `growth`: no error grows in the last third of
-    the run.  `end`: no block ends with a larger error than it started with.  `distance`, where robots do not avoid each
-    other: they keep `avoidance.avoidance_radius` all the same.  `avoidance`, where they do: they keep it, and avoidance had
-    something to do. `saturation`: no robot's limits act for too long.  `messages`: something arrives, and is used, over every
-    link.  `silence`: no robot says nothing for too long.  `refused`: no message is refused.  `late`, on a wall clock: stages
-    run in time.  `drives`, where the torque path is closed: all drives come up, and none is in fault at the end that the
-    scenario has no event for. `referee`: nothing on the bus breaks the contract.  `recording`: it lacks nothing"""
+    the run.  `end`: no block ends with a larger error than it started with.  `distance`, if avoidance is off: robots keep
+    `avoidance.avoidance_radius` nevertheless.  `avoidance`, if it is on: robots keep that radius, and avoidance acted at least
+    once.  `saturation`: no robot's limits act for too long.  `messages`: on every link messages arrive and are used.
+    `silence`: no robot is silent for too long.  `refused`: no message is refused.  `late`, on a wall clock: stages run in time.
+    `drives`, if the torque path is closed: all drives come up, and at the end no drive has a fault without an event that
+    explains it.  `referee`: nothing on the bus breaks the contract.  `recording`: the recording is complete"""
 
     off: list[CheckName] = []
-    """Checks that this scenario is not put to"""
+    """Checks that are left out"""
     dwell: NonNegative | None = None
-    """For how long an error must stay in its band until the run ends to count as settled, in multiples of the block's time
-    scale σ; 3/√k1 unless given, nearly half a period of its own oscillation"""
+    """How long an error must stay in its band before the run ends to count as settled, in multiples of the block's time scale
+    σ; unless given 3/√k1, nearly half a period of the block's own oscillation"""
     floor: Positive = 0.001
-    """Errors up to this are not judged, nor need a block that starts within it get closer [m]"""
+    """Errors up to this size are not judged [m]; a block that starts with such an error need not get closer"""
     growth: Annotated[float, Field(strict=True, ge=1, allow_inf_nan=False)] = 1.05
-    """How many times as large an error may be in the last sixth of the run as in the sixth before"""
+    """Largest ratio of an error in the last sixth of the run to the error in the sixth before"""
     saturation: Fraction = 0.2
-    """Share of the time in which a robot's limits may act"""
+    """Largest share of the time in which a robot's limits act"""
     silence: Seconds = 0.5
-    """For how long a robot may say nothing [s]; at least two of its periods"""
+    """Longest time in which a robot sends nothing [s]; never less than two of its periods"""
     late: Fraction = 0.1
-    """Share of the stages that may run at their deadline without something they wanted, on a wall clock"""
+    """Largest share of stages that run at their deadline without all of their inputs, on a wall clock"""
 
 
 class Scenario(Table):
-    """A whole scenario: one TOML file.  Numbers are in SI units; of angles, `heading`, `phase` and `rate` are in radians,
-    `rotation` and `angle` in degrees."""
+    """A whole scenario: one TOML file.  Numbers are in SI units.  The angles `heading` and `phase` and the angular speed `rate`
+    use radians, the angles `rotation` and `angle` degrees."""
 
     name: Name
-    """What it is called; runs are called after it"""
+    """Name of the scenario; the folders of its runs begin with it"""
     description: str = ""
-    """What it shows, for people"""
+    """What the scenario shows, in words"""
     duration: Positive
-    """How long it runs [s of run time]; a multiple of the coordinator's period"""
+    """Length of the run [s of run time]; a multiple of the coordinator's period"""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = 1
-    """Of everything random: delays, losses, error frames"""
+    """Seed of all random draws: delays, losses, error frames"""
     periods: Periods = Periods()
-    """How often things happen"""
+    """The periods of accelerations and torques"""
     robot: RobotTable = RobotTable()
-    """What all robots have in common"""
+    """Values that all robots share"""
     formation: Group
     """The root of the tree"""
     trajectory: TrajectoryField
-    """Where the centroid of all robots is to be: `line`, `circle`, `sine`, `waypoints`, or a trajectory of your own"""
+    """Desired trajectory of the centroid of all robots: `line`, `circle`, `sine`, `waypoints`, or your own"""
     law: Law = Field(default_factory=dict, validate_default=True)
     """The control law"""
     avoidance: Avoidance = Avoidance()
     """Collision avoidance"""
     links: list[LinkRule] = []
-    """Delay and loss between robots, leaders and coordinator; without any, messages are there in the tick they are sent in"""
+    """Delay and loss of the links between robots, leaders and coordinator; without a rule a link has neither"""
     can: Can = Can()
     """The CAN bus, or buses"""
     record: Record = Record()
     """The recording"""
     claims: list[Claim] = []
-    """What the run is expected to show"""
+    """Claims: what the run shows if all is well"""
     health: Health = Health()
-    """Checks that every run is put to, whatever it claims"""
+    """Limits of the checks that are made of every run"""
     events: list[Event] = []
-    """What happens on schedule, in run time"""
+    """Scheduled events: faults of drives, emergency stops, disturbances of a bus"""

@@ -1,37 +1,40 @@
-"""Kinds of values in a scenario, as pydantic checks them, and the table that holds them."""
+"""Types of values in a scenario, which pydantic checks, and the base class of all tables."""
 
 from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
-# Numbers are strict: neither true nor "1.5" is one.
+# Numbers are strict: pydantic refuses `true` and "1.5".
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(strict=True, gt=0, le=1e6, allow_inf_nan=False)]
-"""A duration, or an instant, that is not absurd"""
+"""A duration or an instant [s], at most 10⁶ s"""
 SecondsOrZero = Annotated[float, Field(strict=True, ge=0, le=1e6, allow_inf_nan=False)]
 Constant = Annotated[float, Field(strict=True, ge=1e-6, le=1e6, allow_inf_nan=False)]
-"""A property of a motor"""
+"""A physical property of a motor"""
 ConstantOrZero = Annotated[float, Field(strict=True, ge=0, le=1e6, allow_inf_nan=False)]
 Limit = Annotated[float, Field(strict=True, gt=0)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Flag = Annotated[bool, Field(strict=True)]
 Point = tuple[Finite, Finite]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
-"""Of a scenario, robot, group or bus.  Where hyphens are not allowed (ROS topics, DBC identifiers) they become underscores"""
+"""Name of a scenario, robot, group or bus.  In ROS topics and DBC identifiers, which allow no hyphens, they become
+underscores"""
 NodeId = Annotated[int, Field(strict=True, ge=0, le=127)]
 Bitrate = Annotated[int, Field(strict=True, ge=10_000, le=1_000_000)]
 Matrix = list[list[Finite]]
 
 
 def number_or_table(value: Any) -> str:
-    """Tells which member of a union a value is meant to be, so that a mistake in it is explained as that member's."""
+    """Returns the tag of the union's member that a value is meant for, so that pydantic explains mistakes of that member
+    only."""
     return "a table" if isinstance(value, (dict, BaseModel)) else "a number"
 
 
 def number_or_array(value: Any) -> str:
+    """Returns the tag of the union's member that a value is meant for, as `number_or_table`."""
     return "an array" if isinstance(value, (list, tuple)) else "a number"
 
 
@@ -44,8 +47,9 @@ CouplingGain = Annotated[
 
 
 def alike(names: Iterable[str]) -> str | None:
-    """Returns the name that differs from an earlier one by hyphens and underscores alone, or None: topics and DBC
-    identifiers could not tell the two apart."""
+    """Returns the first name that differs from an earlier one only by hyphens and underscores, or None.
+
+    Such names would be the same in topics and DBC identifiers."""
     known: dict[str, str] = {}
     return next((name for name in names if known.setdefault(name.replace("-", "_"), name) != name), None)
 
@@ -53,7 +57,7 @@ def alike(names: Iterable[str]) -> str | None:
 def path_matches(pattern: str, path: str) -> bool:
     """True if a path fits a pattern chunk by chunk: `*` stands for one chunk, `**` for any number of them."""
     chunks = path.split("/")
-    fitted = {0}  # how many of the path's chunks the pattern may have used up so far
+    fitted = {0}  # the numbers of leading chunks of the path that the pattern up to here can match
     for want in pattern.split("/"):
         if want == "**":
             fitted = set(range(min(fitted), len(chunks) + 1)) if fitted else fitted
@@ -63,6 +67,6 @@ def path_matches(pattern: str, path: str) -> bool:
 
 
 class Table(BaseModel):
-    """A TOML table: unknown keys are mistakes."""
+    """Base class of all tables of a scenario.  Unknown keys are mistakes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -15,7 +15,7 @@ from echelon.controller.trajectory import TRAJECTORIES, Trajectory
 from echelon.errors import PartRunError
 from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError
-from echelon.plugins import Group, Part, PartError, Plugin, Registry, Source
+from echelon.plugins import Part, PartError, PartGroup, Plugin, Registry, Source
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.probe import probe
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
@@ -49,10 +49,10 @@ def _patience(use: str) -> Iterator[None]:
 
 REGISTRY: Final = PatientRegistry(
     {
-        "laws": Group("laws", Law, LAWS),
-        "plants": Group("plants", Plant, PLANTS),
-        "trajectories": Group("trajectories", Trajectory, TRAJECTORIES),
-        "protocols": Group("protocols", DriveProtocol, PROTOCOLS, DEFAULT),
+        "laws": PartGroup("laws", Law, LAWS),
+        "plants": PartGroup("plants", Plant, PLANTS),
+        "trajectories": PartGroup("trajectories", Trajectory, TRAJECTORIES),
+        "protocols": PartGroup("protocols", DriveProtocol, PROTOCOLS, DEFAULT),
     }
 )
 """All groups of parts, with what is built in."""

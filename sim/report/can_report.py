@@ -5,7 +5,7 @@ from dataclasses import fields
 from typing import Final
 
 from echelon.bridge.reports import BusReport, CanReport, IdentifierReport, RefereeReport
-from echelon.sim.report.page import paragraph, subheading, table
+from echelon.sim.report.page import paragraph, rest, subheading, table
 from echelon.sim.results.summary import number
 
 MAX_ROWS: Final = 60
@@ -31,7 +31,7 @@ def can_section(can: CanReport | None, frames: Sequence[Mapping[str, object]]) -
     if frames:
         keys = list(frames[0])
         rows = [[frame.get(key, "") for key in keys] for frame in frames[:MAX_ROWS]]
-        text += subheading("First frames") + table(keys, rows, numeric_from=len(keys))
+        text += subheading("First frames") + table(keys, rows, numeric_from=len(keys), what="frames")
     return text
 
 
@@ -54,9 +54,12 @@ def _sentences(can: CanReport) -> list[str]:
 
 def _referee(referee: RefereeReport) -> str:
     found = ", ".join(f"{count} {kind}" for kind, count in referee.kinds.items()) or "nothing wrong"
-    text = subheading("Referee") + paragraph(f"It looked at {referee.frames} frames and found {found}.")
+    words = subheading("Referee") + paragraph(f"It looked at {referee.frames} frames and found {found}.")
     rows = [[f"{row.time:.6g}", row.bus, row.id, row.robot, row.kind, row.text] for row in referee.findings[:MAX_ROWS]]
-    return text + (table(["t [s]", "bus", "identifier", "robot", "kind", "what"], rows, numeric_from=6) if rows else "")
+    if not rows:
+        return words
+    head = ["t [s]", "bus", "identifier", "robot", "kind", "what"]
+    return words + table(head, rows, numeric_from=6, what="findings") + rest(len(referee.findings), MAX_ROWS)
 
 
 def _happened(can: CanReport) -> str:
@@ -68,7 +71,8 @@ def _happened(can: CanReport) -> str:
     if not rows:
         return ""
     shown = [[f"{time:.6g}", *rest] for time, *rest in sorted(rows)[:MAX_ROWS]]
-    return subheading("What happened") + table(["t [s]", "", "who", "what"], shown, numeric_from=4)
+    events = table(["t [s]", "", "who", "what"], shown, numeric_from=4, what="events")
+    return subheading("What happened") + events + rest(len(rows), MAX_ROWS)
 
 
 def _until(time_s: float | None) -> str:
@@ -76,13 +80,13 @@ def _until(time_s: float | None) -> str:
 
 
 def _bus(bus: BusReport) -> str:
-    rows = [_identifier(can_id, row) for can_id, row in list(bus.identifiers.items())[:MAX_ROWS]]
+    rows = [_identifier(can_id, row) for can_id, row in bus.identifiers.items()]
     if not any(row[1] for row in rows):
         return ""
     head = ["identifier", "frames", "lost", "sent again", "mean latency [ms]", "largest [ms]", "bound [ms]"]
     load = f"{bus.name}: {100 * bus.load:.3g} % of {bus.bitrate / 1e3:g} kbit/s"
     bound = "The bound is for cyclic frames alone: what brings drives up, clears faults or is sent again comes on top."
-    return subheading(load) + table(head, rows) + paragraph(bound)
+    return subheading(load) + paragraph(bound) + table(head, rows, what="identifiers")
 
 
 def _identifier(can_id: str, row: IdentifierReport) -> list[object]:
@@ -102,7 +106,7 @@ def _robots(can: CanReport) -> str:
         warm = [_plain(drives[name].temperature)] if name in drives else []
         rows.append([name, *(_plain(getattr(row, key)) for key in keys), stopped, *warm])
     head = ["robot", *(key.replace("_", " ") for key in keys), "stopped", *(["winding [°C]"] if drives else [])]
-    return subheading("Robots") + table(head, rows)
+    return subheading("Robots") + table(head, rows, what="robots") + rest(len(can.robots), MAX_ROWS)
 
 
 def _milliseconds(seconds: float | None) -> str:

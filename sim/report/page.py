@@ -1,9 +1,11 @@
-"""The report's page: HTML of headings, tables, figures and verdicts, with its own style; text is escaped here."""
+"""The report's page: HTML of headings, tables, figures and verdicts, styled by page.css; text is escaped here."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 from typing import Final
 
+from echelon.sim.report.drawing import Picture
 from echelon.sim.results.records import Summary
 from echelon.sim.results.summary import number
 
@@ -11,49 +13,19 @@ OUTCOMES: Final = {"passed": "holds", "failed": "fails", "not tested": "quiet"}
 """How the outcome of a check is marked in a table"""
 LONG: Final = 24
 """A table's text of more characters may take several lines."""
-STYLE: Final = """
-:root{--ink:#26262b;--quiet:#70707a;--rule:#e3e3e8;--good:#0a7a55;--bad:#c02a23;
---sans:'Inter','Source Sans 3','Helvetica Neue',Arial,'Liberation Sans',sans-serif}
-*{box-sizing:border-box}
-body{margin:0 auto;padding:3rem 2.2rem 4rem;max-width:74rem;color:var(--ink);background:#fff;
-font:15px/1.55 var(--sans);font-variant-numeric:tabular-nums}
-h1{font-size:2rem;line-height:1.2;letter-spacing:-.02em;margin:0 0 .3rem;font-weight:650}
-h2{font-size:1.18rem;letter-spacing:-.01em;margin:3.2rem 0 .3rem;padding-top:1rem;border-top:1px solid var(--rule)}
-h3{font-size:.95rem;margin:1.2rem 0 .3rem;font-weight:600}
-p{margin:.3rem 0 .8rem;max-width:48rem}.quiet,figcaption{color:var(--quiet)}
-.lead{font-size:1.05rem}
-.columns{display:grid;gap:1.4rem 2rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,28rem),1fr))}
-.columns>*{min-width:0}
-figure{margin:.8rem 0;break-inside:avoid}figure svg{display:block;width:100%;height:auto}
-figcaption{font-size:.84rem;line-height:1.45;margin-top:.4rem}
-.verdict{border-left:4px solid var(--good);background:#f2f9f6;padding:.75rem 1.1rem;margin:1rem 0;break-inside:avoid}
-.verdict.fails{border-color:var(--bad);background:#fdf4f3}
-.verdict b{color:var(--good)}.verdict.fails b{color:var(--bad)}
-.verdict ul{margin:.3rem 0 0;padding-left:1.1rem}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(8.6rem,1fr));gap:.2rem 1.4rem;margin:1rem 0 0}
-.tile{border-top:1px solid var(--rule);padding:.5rem 0}
-.tile span{display:block;font-size:.78rem;color:var(--quiet)}.tile strong{font-size:1.22rem;font-weight:600}
-.scroll{overflow-x:auto}
-table{border-collapse:collapse;font-size:.84rem;margin:.6rem 0;width:100%}
-th{font-weight:600;color:var(--quiet);text-align:left;border-bottom:1.5px solid #b9b9c2;padding:.3rem .7rem .3rem 0}
-td{border-bottom:1px solid var(--rule);padding:.26rem .7rem .26rem 0;white-space:nowrap}
-.n{text-align:right}td.w{white-space:normal}tr{break-inside:avoid}
-.holds{color:var(--good);font-weight:600}.fails td.mark,.mark.fails{color:var(--bad);font-weight:600}
-pre{font:11.5px/1.5 ui-monospace,'DejaVu Sans Mono',Consolas,monospace;columns:2;column-gap:2.5rem;
-white-space:pre-wrap;overflow-wrap:anywhere;margin:.8rem 0;color:#3c3c44}
-@media(max-width:48rem){body{padding:1.4rem 1rem}pre{columns:1}}
-@media print{@page{size:A4;margin:14mm}body{padding:0;max-width:none;font-size:9.5pt}
-h2{break-after:avoid;margin-top:1.6rem}
-.columns.pair{grid-template-columns:1fr 1fr}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}}
-"""
+FOLDED: Final = 12
+"""A table of more rows is folded."""
+GENERATOR: Final = '<meta name="generator" content="echelon">'
+"""By which a report is known to be one"""
 
 
 def page(title: str, parts: Iterable[str]) -> str:
     """Returns a whole document that needs nothing but itself."""
+    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body>\n"
+        f"{GENERATOR}<title>{escape(title)}</title><style>\n{style}</style></head>\n<body>\n"
         + "\n".join(parts)
         + "\n</body></html>\n"
     )
@@ -89,9 +61,9 @@ def section(heading: str, text: str, cells: Sequence[str]) -> str:
     return f"<section><h2>{escape(heading)}</h2>{words}{side_by_side(cells)}</section>"
 
 
-def figure(svg: str, alternative: str, caption: str) -> str:
+def figure(picture: Picture, alternative: str, caption: str) -> str:
     """Returns a figure; `alternative` says in words what it shows."""
-    drawn = svg.replace("<svg ", f'<svg role="img" aria-label="{escape(alternative)}" ', 1)
+    drawn = picture.svg.replace("<svg ", f'<svg role="img" aria-label="{escape(alternative)}" ', 1)
     return f"<figure>{drawn}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
@@ -120,8 +92,15 @@ def tiles(values: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: int = 1) -> str:
-    """Returns a table; columns from `numeric_from` on are aligned right, None is a dash, True and False are words."""
+def fold(words: str, content: str) -> str:
+    """Returns what is shown once it is unfolded."""
+    return f"<details><summary>{escape(words)}</summary>{content}</details>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: int = 1, what: str = "rows") -> str:
+    """Returns a table; columns from `numeric_from` on are aligned right, None is a dash, True and False are words.
+
+    A long one is folded, and says how many of `what` are in it."""
 
     def cell(at: int, value: object) -> str:
         if isinstance(value, bool):
@@ -136,7 +115,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: i
         f'<th scope="col"{" class=n" * (at >= numeric_from)}>{escape(name)}</th>' for at, name in enumerate(head)
     )
     body = "".join("<tr>" + "".join(cell(at, value) for at, value in enumerate(row)) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table></div>'
+    whole = f'<div class="scroll"><table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table></div>'
+    return whole if len(rows) <= FOLDED else fold(f"{len(rows)} {what}", whole)
+
+
+def rest(count: int, shown: int) -> str:
+    """Returns how many rows a table of `count` lacks because it shows `shown` at most."""
+    return paragraph(f"{count - shown} more are in the summary.") if count > shown else ""
 
 
 def preformatted(text: str) -> str:

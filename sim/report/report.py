@@ -1,4 +1,4 @@
-"""The report: one HTML file about one run or several side by side; no scripts, nothing from the network, printable."""
+"""The report: one HTML file about one run or several; no scripts, nothing from the network, printable."""
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -6,21 +6,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from echelon.files import write_text
 from echelon.sim.report.can_report import can_section
+from echelon.sim.report.comparison import WIDTH, Compared, comparison
+from echelon.sim.report.differences import differences
+from echelon.sim.report.drawing import Picture, TimeAxis
 from echelon.sim.report.figures import (
+    CALM_DISTANCE,
+    CALM_TORQUE,
     SMALL_MULTIPLES,
+    TorqueScale,
+    distance_time,
     errors,
     smallest_distance,
+    torque_time,
     trajectories,
     transformed_state,
     wheel_torques,
 )
 from echelon.sim.report.page import (
     figure,
+    fold,
     header,
     page,
     paragraph,
     preformatted,
+    rest,
     section,
     side_by_side,
     subheading,
@@ -28,12 +39,15 @@ from echelon.sim.report.page import (
     tiles,
     verdict,
 )
+from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.block_series import Blocks, block_series
 from echelon.sim.results.distances import Distances, distances
 from echelon.sim.results.records import Summary
 from echelon.sim.results.summary import number
 from echelon.sim.results.trace import Trace
 
+PAPER: Final = "paper"
+"""The name of the scenario whose figures the paper has"""
 MAX_ROWS: Final = 60
 """Rows of a table on the page; the summary has them all."""
 
@@ -68,12 +82,47 @@ class _Shown:
 
 def write_report(runs: Sequence[RunForReport], path: Path) -> None:
     """Writes the report of one run, or a comparison.  Raises ValueError without a run; OSError."""
+    shown = _shown(runs, WIDTH if len(runs) == 1 else WIDTH / 2 - 0.15)
+    title = " · ".join(dict.fromkeys(run.summary.scenario for run in runs))
+    write_text(path, page(f"{title}: {', '.join(run.name for run in runs)}", _parts(title, shown)))
+
+
+def save_figures(runs: Sequence[RunForReport], folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Writes each figure of a report as a file of its own, `<figure>.<format>`, into a folder, which is made if need be; of
+    several runs as `<run>-<figure>.<format>`, and `compared-<figure>.<format>`.  Returns the files.
+
+    Raises ValueError without a run, or for another format than drawing.FORMATS; OSError."""
+    shown = _shown(runs, WIDTH)
+    pictures: dict[str, Picture] = {}
+    if len(shown) > 1:
+        pictures |= {f"compared-{name}": picture for name, (picture, _) in comparison(_compared(shown)).items()}
+    for one in shown:
+        prefix = one.run.name.replace("/", "-") + "-" if one.several else ""
+        pictures |= {f"{prefix}{name}": make(one) for name, make in FIGURES.items()}
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [(folder / f"{name}.{kind}", picture) for name, picture in pictures.items() for kind in formats]
+    for path, picture in files:
+        picture.save(path)
+    return [path for path, _ in files]
+
+
+def _shown(runs: Sequence[RunForReport], width: float) -> list[_Shown]:
     if not runs:
         raise ValueError("a report needs at least one run")
-    width = 5.6 if len(runs) > 1 else 11.5
-    shown = [_Shown(run, block_series(run.trace), distances(run.trace), width, len(runs) > 1) for run in runs]
-    title = " · ".join(dict.fromkeys(run.summary.scenario for run in runs))
-    path.write_text(page(f"{title}: {', '.join(run.name for run in runs)}", _parts(title, shown)), encoding="utf-8")
+    return [_Shown(run, block_series(run.trace), distances(run.trace), width, len(runs) > 1) for run in runs]
+
+
+def _compared(shown: Sequence[_Shown]) -> list[Compared]:
+    return [Compared(one.run.name, one.run.trace, one.blocks, one.near) for one in shown]
+
+
+FIGURES: Final[Mapping[str, Callable[[_Shown], Picture]]] = {
+    "trajectories": lambda one: trajectories(one.run.trace, one.width),
+    "blocks": lambda one: transformed_state(one.blocks, one.run.trace.plan, one.width),
+    "errors": lambda one: errors(one.blocks, one.run.trace.plan, one.width),
+    "distance": lambda one: smallest_distance(one.near, one.run.trace.plan, one.width),
+    "torques": lambda one: wheel_torques(one.run.trace, one.width),
+}
 
 
 def _parts(title: str, shown: Sequence[_Shown]) -> list[str]:
@@ -87,9 +136,11 @@ def _parts(title: str, shown: Sequence[_Shown]) -> list[str]:
     def each(cell: Callable[[_Shown], str]) -> list[str]:
         return [_named(one) + cell(one) for one in shown]
 
+    descriptions = list(dict.fromkeys(_description(run.scenario) for run in runs))
     return [
-        header(title, _description(runs[0].scenario), _facts(runs)),
+        header(title, descriptions[0] if len(descriptions) == 1 else "", _facts(runs)),
         *(verdict(run.name, run.summary) for run in runs),
+        *(_comparison(shown) if len(shown) > 1 else ()),
         side_by_side(each(_tiles)),
         section("Claimed and measured", settled, [_claims(runs) + side_by_side(each(_separation))]),
         section("Trajectories", "", each(_trajectories)),
@@ -100,7 +151,23 @@ def _parts(title: str, shown: Sequence[_Shown]) -> list[str]:
         section("Wheel torques", "", each(_torques)),
         section("CAN bus", "", each(_can)),
         section("Links", "Ages [s] are of the message in use, at each use.", each(_links)),
-        section("Effective scenario", "Every default written out.", each(lambda one: preformatted(one.run.scenario))),
+        section("Effective scenario", "Every default written out.", each(_scenario)),
+    ]
+
+
+def _comparison(shown: Sequence[_Shown]) -> list[str]:
+    """Returns what differs between runs, and their curves in the same figures."""
+    names = [one.run.name for one in shown]
+    rows = differences([one.run.scenario for one in shown], [one.run.summary for one in shown])
+    words = "Keys of the effective scenarios, as --set takes them, and how the runs were made."
+    differing = table(["key", *names], rows, numeric_from=len(names) + 1, what="keys")
+    figures = "".join(
+        figure(picture, f"{caption} Compared: {', '.join(names)}.", caption)
+        for picture, caption in comparison(_compared(shown)).values()
+    )
+    return [
+        section("What differs", words, [differing if rows else paragraph("Nothing: the same scenario, run alike.")]),
+        section("Compared", "The same curves of all runs in one figure; each run by itself is below.", [figures]),
     ]
 
 
@@ -112,13 +179,15 @@ def _description(scenario: str) -> str:
 
 
 def _facts(runs: Sequence[RunForReport]) -> list[str]:
-    plan = runs[0].trace.plan
-    digests = [f"trace {run.summary.trace_digest[:12]}" for run in runs]
+    def all_of(values: Sequence[str]) -> str:
+        return values[0] if len(set(values)) == 1 else ", ".join(values)
+
+    plans = [run.trace.plan for run in runs]
     return [
-        f"{len(plan.robots)} robots",
-        f"{len(plan.nodes)} nodes",
-        f"{number(plan.duration_ns / 1e9, 's')}",
-        *digests,
+        f"{all_of([str(len(plan.robots)) for plan in plans])} robots",
+        f"{all_of([str(len(plan.nodes)) for plan in plans])} nodes",
+        all_of([number(plan.duration_ns / 1e9, "s") for plan in plans]),
+        *(f"trace {run.summary.trace_digest[:12]}" for run in runs),
     ]
 
 
@@ -168,28 +237,35 @@ def _trajectories(one: _Shown) -> str:
     number_of_figure, how = ("3", "with") if plan.avoidance.enabled else ("2", "without")
     what = f"Paths of the {len(plan.robots)} robots {how} avoidance"
     return figure(
-        trajectories(one.run.trace, one.width),
+        FIGURES["trajectories"](one),
         f"{what}; smallest distance {number(distance.smallest, 'm')}.",
-        f"{what} (the paper's Fig. {number_of_figure}). Open triangles: start; filled: end, pointing in heading "
-        "direction; tinted: each group's final shape. Dashed: desired centroid; black: its real path.",
+        f"{what}{_in_paper(one, f' (the paper’s Fig. {number_of_figure})')}. Open triangles: start; filled: end, pointing in "
+        "heading direction; tinted: each group's final shape. Dashed grey: desired centroid; black: its real path.",
     )
+
+
+def _in_paper(one: _Shown, text: str) -> str:
+    """Returns a text if the run shows what the paper shows."""
+    return text if one.run.summary.scenario == PAPER else ""
 
 
 def _transformed(one: _Shown) -> str:
     return figure(
-        transformed_state(one.blocks, one.run.trace.plan, one.width),
+        FIGURES["blocks"](one),
         "Every shape variable and the centroid over time, on a linear and a logarithmic axis, with what is desired.",
-        "The paper's Fig. 4, time linear (left) and logarithmic (right). Solid: x; dashed: y; grey bands: desired. "
-        "Colours: groups; purple: inter-group; black: centroid.",
+        f"{_in_paper(one, 'The paper’s Fig. 4. ')}Time linear (left) and logarithmic (right). Solid: x; dashed: y; grey bands: "
+        "desired. Colours and marks: groups; purple: inter-group; black: centroid.",
     )
 
 
 def _errors(one: _Shown) -> str:
     settled = ", ".join(f"{row.name} {number(row.settling_5, 's', 'not')}" for row in one.run.summary.blocks)
+    time = TimeAxis.of(one.run.trace.plan, one.blocks.times_ns)
     return figure(
-        errors(one.blocks, one.run.trace.plan, one.width),
-        f"Error norm of every block over time, both axes logarithmic. Settled to 5 %: {settled}.",
-        "Error norm of every block. Filled dot: settled to 5 % of what it starts with; open dot: to 2 %. Dashed: claims.",
+        FIGURES["errors"](one),
+        f"Error norm of every block over time. Settled to 5 %: {settled}.",
+        "Error norm of every block. Filled mark: settled to 5 % of what it starts with; open mark: to 2 %. Dashed, with words "
+        f"above: claims. {time.words}",
     )
 
 
@@ -227,18 +303,20 @@ def _blocks(one: _Shown) -> str:
 def _distances(one: _Shown) -> str:
     distance = one.run.summary.distance
     violations = distance.violations
+    time = distance_time(one.near, one.run.trace.plan)
     drawn = figure(
-        smallest_distance(one.near, one.run.trace.plan, one.width),
+        FIGURES["distance"](one),
         f"Smallest distance between robots over time; the smallest is {number(distance.smallest, 'm')}.",
-        "Smallest distance of all pairs; between recorded instants robots are taken to move straight. Circle: the "
-        "closest encounter. Tinted: closer than the avoidance radius rₐ. Rₛ: sensing radius."
+        "Smallest distance of all pairs; between recorded instants robots are taken to move straight. Circle: the closest "
+        f"encounter. Tinted: closer than the avoidance radius rₐ. Rₛ: sensing radius. {time.words_then(CALM_DISTANCE)}"
         + ("" if distance.avoidance_enabled else " Avoidance is not enabled: robots keep out of it by chance."),
     )
     if not violations:
         return drawn + paragraph("No pair came within the avoidance radius.")
     shown = sorted(violations, key=lambda row: row.smallest)[:MAX_ROWS]
     rows = [[" – ".join(row.pair), f"{row.first:.6f}", f"{row.last:.6f}", row.smallest] for row in shown]
-    return drawn + table(["violation", "from [s]", "to [s]", "smallest [m]"], rows) + _rest(len(violations))
+    head = ["violation", "from [s]", "to [s]", "smallest [m]"]
+    return drawn + table(head, rows, what="violations") + rest(len(violations), MAX_ROWS)
 
 
 def _torques(one: _Shown) -> str:
@@ -249,14 +327,16 @@ def _torques(one: _Shown) -> str:
         values = [_engineering(row.rms), _engineering(row.peak), number(row.peak_time)]
         saturated = "–" if row.saturation_share is None else f"{100 * row.saturation_share:.3g}"
         rows.append([row.robot, *values, saturated, row.saturated_after_first_second])
+    trace = one.run.trace
     drawn = figure(
-        wheel_torques(one.run.trace, one.width),
+        FIGURES["torques"](one),
         "Wheel torques of every robot over time.",
-        f"Wheel torques, mean of each period{which}. In the group's colour: right wheel; grey: left. Time is "
-        "logarithmic, torque too beyond the innermost marks. Dashed, where there is one: the torque limit.",
+        f"Wheel torques, mean of each period{which}. In the group's colour: right wheel; grey: left. Dashed, where it is in "
+        f"the picture: the torque limit. {torque_time(trace).words_then(CALM_TORQUE)} {TorqueScale.of([trace]).words}".rstrip(),
     )
+    steps = steps_text(trace)
     head = ["robot", "RMS [N\u00a0m]", "peak [N\u00a0m]", "at [s]", "saturated [%]", "after 1\u00a0s"]
-    return drawn + table(head, rows) + _rest(count)
+    return drawn + (paragraph(steps) if steps else "") + table(head, rows, what="robots") + rest(count, MAX_ROWS)
 
 
 def _can(one: _Shown) -> str:
@@ -275,11 +355,14 @@ def _links(one: _Shown) -> str:
         ]
         for row in links[:MAX_ROWS]
     ]
-    return table(head, rows, numeric_from=2) + _rest(len(links)) if rows else paragraph("No links were counted.")
+    if not rows:
+        return paragraph("No links were counted.")
+    return table(head, rows, numeric_from=2, what="links") + rest(len(links), MAX_ROWS)
 
 
-def _rest(count: int) -> str:
-    return paragraph(f"{count - MAX_ROWS} more are in the summary.") if count > MAX_ROWS else ""
+def _scenario(one: _Shown) -> str:
+    lines = one.run.scenario.count("\n")
+    return fold(f"scenario.toml, {lines} lines", preformatted(one.run.scenario))
 
 
 def _engineering(value: float | None, unit: str = "") -> str:

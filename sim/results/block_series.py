@@ -18,7 +18,7 @@ VELOCITY = field_index(STATE_FIELDS, "vx", "vy")
 
 @dataclass(frozen=True, slots=True)
 class BlockSeries:
-    """A block Z_b of the transformed state (theory.md section 2) at T instants; arrays are (T, block.size).
+    """A block Z_b of the transformed state (docs/architecture.md, 2.3) at T instants; arrays are (T, block.size).
 
     error e = Z_b - Z_bd [m], rate dZ_b/dt [m/s], error_rate de/dt [m/s]; norm |e| is (T,) [m]."""
 

@@ -1,9 +1,7 @@
 """Records as JSON and back, and the schema of summary.json."""
 
-import ast
 import inspect
 import json
-import textwrap
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -11,6 +9,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from echelon.docstrings import field_docstrings
+from echelon.files import write_text
 from echelon.sim.results.records import Summary
 
 
@@ -34,7 +34,7 @@ def json_text(value: Any) -> str:
 
 def write_summary(summary: Summary, path: Path) -> None:
     """Writes summary.json.  Raises OSError."""
-    path.write_text(json_text(summary) + "\n", encoding="utf-8")
+    write_text(path, json_text(summary) + "\n")
 
 
 def read_summary(path: Path) -> Summary:
@@ -81,9 +81,5 @@ def _records() -> list[type]:
 def _describe(table: dict[str, Any], record: type) -> None:
     """Puts the docstrings of a record and of its fields into its part of the schema."""
     table["description"] = inspect.getdoc(record)
-    body = ast.parse(textwrap.dedent(inspect.getsource(record))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    for statement, following in zip(body.body, body.body[1:], strict=False):
-        match statement, following:
-            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                table["properties"][name]["description"] = inspect.cleandoc(text)
+    for name, text in field_docstrings(record).items():
+        table["properties"][name]["description"] = text

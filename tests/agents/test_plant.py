@@ -1,4 +1,4 @@
-"""All plants against scipy's integrator, against the paper's equation and Newton's, and against known solutions."""
+"""All plants against scipy's integrator, against the equations of the paper and of Newton, and against known solutions."""
 
 import time
 import warnings
@@ -28,7 +28,7 @@ def robot_of(path: str, model: str) -> RobotPlan:
 
 
 def rates(robot: RobotPlan, right: float, left: float):
-    """Returns d(x, y, θ, v, ω)/dt of a plant, straight from theory.md section 1."""
+    """Returns the function for d(x, y, θ, v, ω)/dt of a plant, written from docs/architecture.md, 2.1 and 2.2."""
     m1, inertia, r, arm, d = robot.mass, robot.inertia, robot.wheel_radius, robot.arm, robot.offset
     push, turn = (right + left) / r, arm * (right - left) / r
 
@@ -44,7 +44,7 @@ def rates(robot: RobotPlan, right: float, left: float):
         return [*p_dot, omega, push / m1 + d * omega**2, (turn - m1 * d * v * omega) / (i_c + m1 * d**2)]
 
     def hill(_, s):
-        """Newton for the mass and Euler about it, with the force N that keeps the axle from slipping sideways."""
+        """Newton's law for the mass and Euler's law about it; the force N keeps the axle from slipping sideways."""
         _, _, theta, v, omega = s
         m, i_c, c = m1 + HILL["load"], inertia - m1 * d**2, HILL["resistance"]
         along, across = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
@@ -72,7 +72,7 @@ def integrated(robot: RobotPlan, state: RobotState, right: float, left: float, h
 
 
 def close(found, expected, metres: float) -> None:
-    """Positions to `metres`; θ, v, ω to 1e-8 of their size."""
+    """Asserts that positions agree within `metres`, and θ, v, ω within 1e-8 of their size."""
     np.testing.assert_allclose(found[:2], expected[:2], atol=metres, rtol=0)
     np.testing.assert_allclose(found[2:], expected[2:], rtol=1e-8, atol=1e-9)
 
@@ -81,7 +81,7 @@ TORQUES_FAST = ((0, 0), (5e3, -5e3), (-2e4, 3e4))
 TORQUES_LAB = ((0, 0), (1.5, -1.5), (0.3, 0.7), (-1.5, -1.5))
 FAST = list(product((0.0, 2.5), (-850.0, 0.0, 300.0), (-1000.0, -40.0, 0.0, 3.0, 940.0), TORQUES_FAST))
 LAB = list(product((0.0, -2.0), (-1.2, 0.0, 0.8), (-10.0, 0.0, 2.0, 13.0), TORQUES_LAB))
-"""θ, v, ω and wheel torques"""
+"""Tuples of θ, v, ω and the wheel torques"""
 
 
 @pytest.mark.parametrize("model", PLANTS)
@@ -90,7 +90,7 @@ LAB = list(product((0.0, -2.0), (-1.2, 0.0, 0.8), (-10.0, 0.0, 2.0, 13.0), TORQU
     [("paper.toml", FAST, 1e-4, 2e-10), ("paper.toml", FAST, 1e-3, 1e-6), ("lab.toml", LAB, 1e-2, 1e-10)],
 )
 def test_step_is_the_solution(model, path, grid, h, metres):
-    """From robots of a lab to 850 m/s and 1000 rad/s, turns of more than a radian in a step included."""
+    """The grid reaches from robots of a lab to 850 m/s and 1000 rad/s, with turns of more than a radian in a step."""
     robot = robot_of(path, model)
     step = make_step(robot)
     for theta, v, omega, torques in grid:
@@ -109,7 +109,7 @@ def test_two_half_steps_are_one_step(model):
 
 
 def kinetic_energy(robot: RobotPlan, state: RobotState) -> float:
-    """½ m |ṗ|² + ½ I_c ω², with the mass at the reference point and |ṗ|² = v² + d² ω²."""
+    """Returns ½ m |ṗ|² + ½ I_c ω²; the mass is at the reference point, and |ṗ|² = v² + d² ω²."""
     i_c = robot.inertia - robot.mass * robot.offset**2
     return 0.5 * robot.mass * (state.v**2 + (robot.offset * state.omega) ** 2) + 0.5 * i_c * state.omega**2
 
@@ -118,7 +118,7 @@ def kinetic_energy(robot: RobotPlan, state: RobotState) -> float:
 def test_rigid_body_without_torque_is_the_chaplygin_sleigh(v, omega):
     """v̇ = d ω², ω̇ = -m d v ω/I: energy is conserved, and v = V tanh φ, ω = ± V √(m/I) sech φ, φ = (d m/I) V t + φ(0).
 
-    So it ends going forwards (d > 0), whichever way it began."""
+    So in the end it moves forwards (d > 0), whatever its direction at the start."""
     robot = robot_of("lab.toml" if abs(v) < 100 else "paper.toml", "rigid_body")
     step, state, h = make_step(robot), state_at(0.0, 0.0, 0.3, v, omega), 2e-3 / max(1, abs(v) / 10)
     start = kinetic_energy(robot, state)
@@ -138,8 +138,8 @@ MOVING = [(1.0, 5.0, (0, 0)), (-0.7, 2.0, (1.5, -0.5)), (0.0, -3.0, (-1.0, 0.7))
 
 @pytest.mark.parametrize(("v", "omega", "torques"), MOVING)
 def test_rigid_body_obeys_newton_and_euler(v, omega, torques):
-    """The wheels hold the axle, d behind the mass, with an unknown sideways force λ, which acts with the arm -d:
-    m p̈ = F e_v + λ e_n, I_c ω̇ = τ - d λ; so m p̈ · e_v = F and I_c ω̇ + d m p̈ · e_n = τ, whatever λ is."""
+    """An unknown sideways force λ holds the axle, d behind the mass; its lever arm is -d.  m p̈ = F e_v + λ e_n and
+    I_c ω̇ = τ - d λ, so m p̈ · e_v = F and I_c ω̇ + d m p̈ · e_n = τ for any λ."""
     robot, h = robot_of("lab.toml", "rigid_body"), 1e-4
     step, d = make_step(robot), robot.offset
     states = [state_at(0.0, 0.0, 0.4, v, omega)]
@@ -155,7 +155,7 @@ def test_rigid_body_obeys_newton_and_euler(v, omega, torques):
 
 
 def literal(robot: RobotPlan, theta: float, omega: float) -> tuple[Array, Array, Array]:
-    """Returns A, B, C of label 801, entry by entry."""
+    """Returns A, B and C of label 801, written entry by entry."""
     m1, d, r, R = robot.mass, robot.offset, robot.wheel_radius, robot.arm
     J, s, c = robot.inertia - m1 * d**2, np.sin(theta), np.cos(theta)
     A = np.array([[-s * c * omega, -(s**2) * omega], [c**2 * omega, s * c * omega]])
@@ -175,7 +175,7 @@ def velocity(robot: RobotPlan, state: RobotState) -> Array:
 
 
 def test_paper_plant_is_the_equation_of_the_paper():
-    """p̈ by finite differences of ṗ along the step is A ṗ + B u + C, and ṗ is that of p."""
+    """Along a step, p̈ from finite differences of ṗ is A ṗ + B u + C, and finite differences of p give ṗ."""
     robot, h = robot_of("lab.toml", "paper"), 1e-5
     step = make_step(robot)
     for theta, v, omega, torques in LAB:
@@ -191,7 +191,7 @@ def test_paper_plant_is_the_equation_of_the_paper():
 
 @pytest.fixture(scope="module", params=list(PLANTS))
 def lonely(request):
-    """One robot of a model, in a plan of its own."""
+    """Returns a plan of a single robot with a given plant."""
     robot = {"model": request.param, "mass": 10.0, "inertia": 0.5, "wheel_radius": 0.1, "arm": 0.4, "offset": 0.2}
     random = np.random.default_rng(1)
     return plan_of(scenario((None,), random, robot=robot, periods={"acceleration": 1e-3, "torque": 1e-4}))
@@ -201,10 +201,10 @@ WILD = (0.0, 1.0, -1e3, 1e8, -1e16, 1e77, -1e154, 1e200, -1e308, inf, -inf, nan)
 
 
 def test_no_state_and_no_command_raises(lonely):
-    """Whatever the numbers, a robot moves and says: LOST when its own are none any more, and then it stays so."""
+    """A robot moves and sends its state whatever the numbers are.  When they overflow its state is LOST, and stays LOST."""
     robot = Robot(lonely, 0)
     say, move = robot.stages
-    headings = [theta for theta in WILD if not isinf(theta)]  # no robot gets there: its step raises before
+    headings = [theta for theta in WILD if not isinf(theta)]  # no robot has an infinite heading: its step raises before
     for theta, v, omega, ax in product(headings, WILD, WILD, (0.0, -1e6, 1e120, 1e308, inf, nan)):
         robot.state = state_at(0.0, 0.0, theta, v, omega)
         with warnings.catch_warnings():
@@ -230,7 +230,7 @@ DIVERGING = ["duration=1.0", "periods.torque=0.001"]
 
 @pytest.mark.parametrize("model", PLANTS)
 def test_a_diverging_run_ends_and_says_so(model):
-    """Torque held for 1 ms at hundreds of rad/s diverges (theory.md section 7); the run goes on to its end, fast."""
+    """Torque held for 1 ms at hundreds of rad/s diverges (docs/architecture.md, 2.10); the run still reaches its end, soon."""
     _, plan = load(PAPER, [*DIVERGING, f'robot.model="{model}"'])
     states: dict[int, Array] = {}
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""The torque loop: its inverse against the plant, the order of its half-step lead, and the limits of the drives."""
+"""The torque loop: its inverse against the plant, the order of its error with half a step of lead, and its limits."""
 
 from dataclasses import replace
 from itertools import pairwise, product
@@ -53,7 +53,7 @@ def test_robot_with_its_point_behind_the_axle_does_it_too(lab):
 
 
 def drift(robot: RobotPlan, h: float, lead: float) -> float:
-    """Returns how far ṗ is, after 0.2 s of one acceleration, from what it would be under ideal torque [m/s]."""
+    """Returns the difference between ṗ after 0.2 s of one acceleration and its value under continuous torque [m/s]."""
     inverse, step, wanted = make_inverse(robot), make_step(robot), np.array([1.5, -2.0])
     state = state_at(0.0, 0.0, 1.2, 0.6, 2.0)
     start = velocity(robot, state)
@@ -63,7 +63,7 @@ def drift(robot: RobotPlan, h: float, lead: float) -> float:
 
 
 def test_half_a_step_of_lead_takes_away_the_first_order_error(lab):
-    """The error of held torque falls as h without lead, as h² with half a step."""
+    """The error of held torque is of first order in h without lead, and of second order with half a step of lead."""
     steps = [0.02, 0.01, 0.005, 0.0025, 0.00125]
     without, with_half = ([drift(lab, h, lead) for h in steps] for lead in (0.0, 0.5))
     orders = [np.log2(coarse / fine) for coarse, fine in pairwise(without)]
@@ -74,7 +74,8 @@ def test_half_a_step_of_lead_takes_away_the_first_order_error(lab):
 
 
 def test_lead_looks_at_the_robot_as_it_will_be(lab):
-    """Torque with a lead is that without, for the state that ideal torque brings after the lead, up to O(lead²)."""
+    """Torque with a lead equals torque without lead for the state that continuous torque reaches after the lead, up to
+    O(lead²)."""
 
     def ideal(_, s):
         _, _, theta, v, omega = s
@@ -131,7 +132,7 @@ def test_what_is_no_number_becomes_zero():
     assert limits.apply(nan, 1.0, 0.0, 0.0, 0.01) == (0.0, 1.0, True)
     assert limits.apply(1.0, nan, nan, nan, 0.01) == (1.0, 0.0, True)
     assert (limits.tau_right, limits.tau_left) == (1.0, 0.0)
-    for _ in range(2):  # and leaves nothing behind
+    for _ in range(2):  # twice, because NaN must not stay in the state of the limits
         right, left, limited = limits.apply(0.5, 0.5, 0.0, 0.0, 0.01)
     assert (right, left, limited) == (0.5, 0.5, False)
 
@@ -147,7 +148,7 @@ def test_limits_hold_whatever_is_wanted():
         given = np.array([right, left])
         speed = np.array([v + 0.15 * omega, v - 0.15 * omega]) / 0.05
         assert (np.abs(given) <= 1.5).all()
-        cut = (np.abs(speed) > 40) & (given == 0)  # a motor without speed to spare may drop at once
+        cut = (np.abs(speed) > 40) & (given == 0)  # a wheel beyond its speed limit may drop to zero at once
         assert (cut | (np.abs(given - last) <= 1.0 + 1e-12)).all()
         assert not ((np.abs(speed) > 40) & (given * speed > 0)).any()
         assert limited == bool((given != wanted).any())
@@ -155,7 +156,7 @@ def test_limits_hold_whatever_is_wanted():
 
 
 def counted(inner_period: float, commands: list[tuple[float, float]], **limits: float) -> tuple[Array, RobotPlan]:
-    """Returns what a robot says at the end of each 10 ms of its commands, (T, fields)."""
+    """Returns the states that a robot sends at the end of each 10 ms, one for each command, (T, fields)."""
     base = {"mass": 4.0, "inertia": 0.12, "wheel_radius": 0.05, "arm": 0.15, "offset": 0.1}
     plan = plan_of(
         scenario((None,), np.random.default_rng(1), duration=0.01, robot=base | limits,
@@ -173,20 +174,20 @@ def counted(inner_period: float, commands: list[tuple[float, float]], **limits: 
 
 
 def test_saturated_inner_periods_are_counted_exactly():
-    """Straight ahead from rest: both wheels want m r a/2 each; with 100 N m/s they get there in steps of 0.1 N m."""
+    """Straight ahead from rest, each wheel needs m r a/2.  At 100 N m/s it gets there in steps of 0.1 N m."""
     said, robot = counted(0.001, [(9.5, 0.0), (9.5, 0.0), (3.0, 0.0)], torque_rate_limit=100.0)
     wanted = robot.mass * robot.wheel_radius * 9.5 / 2
     assert wanted == pytest.approx(0.95)
     expected = np.minimum(0.1 * np.arange(1, 11), 0.95)
-    assert said[0, FIELD["saturated"]] == 9  # 0.1 .. 0.9, the tenth reaches 0.95
+    assert said[0, FIELD["saturated"]] == 9  # 0.1 to 0.9 are limited, the tenth step reaches 0.95
     assert said[0, FIELD["tau_right"]] == pytest.approx(expected.mean())
     assert said[0, FIELD["tau_left"]] == pytest.approx(expected.mean())
     assert said[0, FIELD["tau_right_square"]] == pytest.approx((expected**2).mean())
     assert said[0, FIELD["tau_left_peak"]] == pytest.approx(0.95)
     assert said[1, FIELD["saturated"]] == 0
-    assert said[2, FIELD["saturated"]] == 6  # down from 0.95 to 0.3: 0.85 .. 0.35, the seventh reaches it
+    assert said[2, FIELD["saturated"]] == 6  # from 0.95 to 0.3: 0.85 to 0.35 are limited, the seventh step reaches 0.3
     np.testing.assert_allclose(said[:, [FIELD["ax"], FIELD["ay"]]], [(9.5, 0), (9.5, 0), (3, 0)])
-    # v = ∫ 2 τ/(m r) dt of what was given
+    # v = ∫ 2 τ/(m r) dt of the limited torques
     assert said[0, FIELD["v"]] == pytest.approx(2 * expected.sum() * 0.001 / (robot.mass * robot.wheel_radius))
 
 

@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_leaves_its_folder(folder: Path) -> None:
-    names = {"scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html"}
+    names = {".echelon.json", "scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html"}
     assert {file.name for file in folder.iterdir()} == names
     plan = plan_of("paper", "duration=0.2")
     summary = json.loads((folder / "summary.json").read_text())
@@ -134,16 +134,6 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments: tuple[str, ...], says:
     assert says in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not done.stdout
-
-
-def test_a_folder_used_again_keeps_nothing_of_the_earlier_run(tmp_path: Path) -> None:
-    notes = tmp_path / "notes.txt"
-    for name in ("can.log", "report.html", "run.mcap", "notes.txt"):
-        (tmp_path / name).write_text("old")
-    done = echelon("run", "paper", *QUICK, "--engine", "inprocess", "--can", "none", "--no-report", "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert {file.name for file in tmp_path.iterdir()} == {"scenario.toml", "run.mcap", "summary.json", "notes.txt"}
-    assert notes.read_text() == "old"
 
 
 def test_a_folder_may_have_any_name_and_a_run_a_single_tick(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The control law against the paper's equations written out, against its error dynamics, and against its own lead."""
+"""The control law against the paper's equations, against the error dynamics, and with look-ahead against its definition."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ EPSILON = (0.5, 0.4, 0.7, 0.6)
 
 
 def paper_like(seed: int, time_scales: str, **tables) -> tuple[dict, Plan]:
-    """Returns the law's table and a plan of three groups of three, with full matrices everywhere."""
+    """Returns the table `[law]` and a plan of three groups of three robots; all gains and couplings are full matrices."""
     random = np.random.default_rng(seed)
     law = random_law(PAPER_TREE, random, time_scales)
     law["epsilon"] = list(EPSILON[:2] if time_scales == "three" else EPSILON)
@@ -32,7 +32,7 @@ def paper_like(seed: int, time_scales: str, **tables) -> tuple[dict, Plan]:
 
 
 def errors(plan: Plan, t: float, x: Array, v: Array) -> tuple[list[Array], list[Array], Array]:
-    """Returns Z_e and its rate for Z_1, Z_2, Z_3, Z_r, z_c, and z̈_cd, all written out for nine robots."""
+    """Returns the errors of Z_1, Z_2, Z_3, Z_r and z_c, their rates, and z̈_cd, written out for nine robots."""
 
     def shape(a, b, c):
         return np.array([(a - b) / np.sqrt(2), c - (a + b) / 2])
@@ -50,7 +50,7 @@ def errors(plan: Plan, t: float, x: Array, v: Array) -> tuple[list[Array], list[
 
 
 def literal_nu(law: dict, sigma: list[float], e: list[Array], e_dot: list[Array], feed: Array) -> list[Array]:
-    """Returns ν of every block, label eqnus, its matrices taken from the law's table by name."""
+    """Returns ν of every block (label eqnus), with the matrices of the table `[law]`."""
     names = ["g0", "g1", "g2", "inter", "centroid"]
     gains = {rule["block"]: (np.array(rule["k1"]), np.array(rule["k2"])) for rule in law["gains"]}
     coupling = {(rule["block"], rule["onto"]): np.array(rule["value"]) for rule in law["coupling"]}
@@ -80,7 +80,7 @@ def test_nu_is_the_law_of_the_paper(time_scales, seed):
 
 
 def test_all_ones_of_the_paper_couple_what_it_names():
-    """Three time scales: K̄_sr, K̄_sc, K̄_rs, K̄_rc, K̄_cs, K̄_cr are all ones; within Z_s there is none."""
+    """With three time scales K̄_sr, K̄_sc, K̄_rs, K̄_rc, K̄_cs and K̄_cr are all ones; within Z_s there is no coupling."""
     _, plan = load(PAPER)
     s, r, c = 12, 4, 2
     ones = np.block(
@@ -95,7 +95,7 @@ def test_all_ones_of_the_paper_couple_what_it_names():
 
 
 def slope(plan: Plan, lead: float | None = None) -> Array:
-    """Returns d(e, ė)/dt = A (e, ė) of Z'' = ν, from the law's answers at unit errors, (4N, 4N)."""
+    """Returns the matrix A of d(e, ė)/dt = A (e, ė) for Z̈ = ν, from the law's answers to unit errors, (4N, 4N)."""
     central = CentralLaw(plan, lead)
     cbt, size = central.transformation, 2 * len(plan.robots)
     z_cd = central.trajectory.at(0.0)
@@ -114,7 +114,7 @@ def slope(plan: Plan, lead: float | None = None) -> Array:
 @SETTINGS
 @given(trees(max_robots=9), SEEDS, st.sampled_from(["three", "multi"]))
 def test_error_dynamics_are_linear_with_the_spectrum_of_their_matrices(tree, seed, time_scales):
-    """Labels eq45, eq207: ë = -K_1 e - (K_2 + K̄) ė for all blocks at once."""
+    """Labels eq45 and eq207: ë = -K_1 e - (K_2 + K̄) ė for all blocks at once."""
     random = np.random.default_rng(seed)
     law = random_epsilon(tree, random, time_scales)
     plan = with_random_gains(plan_of(scenario(tree, random, law=law)), random)
@@ -124,12 +124,12 @@ def test_error_dynamics_are_linear_with_the_spectrum_of_their_matrices(tree, see
     expected = np.block([[np.zeros((size, size)), np.eye(size)], [-k_1, -k_2]])
     found = slope(plan)
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
-    # Two ways to the spectrum: the companion matrix, and the quadratic pencil det(s² I + s K_2 + K_1) = 0.
+    # The spectrum in two ways: the eigenvalues of the companion matrix make s² I + s K_2 + K_1 singular.
     for s in np.linalg.eigvals(found):
         pencil = s**2 * np.eye(size) + s * k_2 + k_1
         singular = np.linalg.svd(pencil, compute_uv=False)
         assert singular[-1] < 1e-7 * singular[0]
-    # Superposition: the answer to a mixture is the mixture of the answers.
+    # Superposition: the answer to a linear combination is the linear combination of the answers.
     central, n = CentralLaw(plan), len(plan.robots)
     one, two, three, four = random.normal(size=(4, n, 2))
     zero = central(0.0, one * 0, one * 0)
@@ -154,7 +154,7 @@ def test_uncoupled_spectrum_is_known():
 @pytest.mark.parametrize("lead", [0.25, 0.5, 1.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_lead_is_the_law_taken_at_the_error_to_come(seed, lead):
-    """η must be what the paper's law gives for e(λT), and its ė(λT) in the block's own damping, under η itself."""
+    """η solves its implicit equation: it is the paper's law for e(λT), with ė(λT) in the block's own damping, both under η."""
     law, plan = paper_like(seed, "three")
     law["epsilon"] = [0.1, 0.1]
     random = np.random.default_rng(seed)
@@ -210,7 +210,7 @@ def test_avoidance_repels_and_leaves_the_centroid_alone():
     more = cbt.forward(CentralLaw(plan)(0.0, x, v) - CentralLaw(bare)(0.0, x, v))
     forces = PairForces(*pairs_between([range(i, i + 1) for i in range(9)]), 9, plan.avoidance)(x)
     f_pot = cbt.matrix @ forces
-    for block in plan.blocks:  # label pbc3t with its sign mended: + k_b F_pot,b
+    for block in plan.blocks:  # label pbc3t with the sign corrected: + k_b F_pot,b
         rows = slice(block.offset // 2, (block.offset + block.size) // 2)
         np.testing.assert_allclose(more[rows], f_pot[rows] / block.sigma, rtol=1e-9, atol=1e-9)
     assert np.abs(f_pot).max() > 1
@@ -219,7 +219,7 @@ def test_avoidance_repels_and_leaves_the_centroid_alone():
 
 
 def test_a_pair_that_meets_is_driven_apart():
-    """Two robots of one group, close to each other, everything else at its place and at rest: they part."""
+    """Two robots of a group are close to each other, all others are at rest in their places: the two are pushed apart."""
     _, bare = paper_like(4, "three")
     plan = with_avoidance(bare)
     cbt = CentralLaw(plan).transformation
@@ -227,5 +227,5 @@ def test_a_pair_that_meets_is_driven_apart():
     x[1] = x[0] + (0.4, 0.0)
     v = np.zeros((9, 2))
     apart = [law(0.0, x, v)[1, 0] - law(0.0, x, v)[0, 0] for law in (CentralLaw(bare), CentralLaw(plan))]
-    force = 50.0 / np.prod(EPSILON[:2])  # capped, and its gain is 1/σ
+    force = 50.0 / np.prod(EPSILON[:2])  # the force is capped, and its gain is 1/σ
     assert apart[1] - apart[0] == pytest.approx(2 * force, rel=0.5)

@@ -1,4 +1,4 @@
-"""Control laws as parts: what they are given, what the tree adds, what is refused, and what is said when one fails."""
+"""Control laws as parts: their arguments, what the tree adds to them, and errors in scenarios and in runs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,23 +38,23 @@ USE = 'law={use="my_laws.py:Spring",parameters={stiffness=3.0},epsilon=[0.5,0.5]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A user's folder with a scenario and a law."""
+    """Returns a user's folder with a scenario and a law."""
     (tmp_path / "mine.toml").write_text((SCENARIOS / "lab.toml").read_text())
     (tmp_path / "my_laws.py").write_text(OWN)
     return tmp_path
 
 
 def of_another(plan: Plan, law: Law) -> Plan:
-    """Returns the plan with a law that is not built in."""
+    """Returns a plan with another law, which is not built in."""
     return replace(plan, law=Part("my_laws.py:Mine", {}, None, law))
 
 
 class Same(Linear):
-    """The linear law, but not as the one that is multiplied out."""
+    """The linear law as another class, so that nodes call it block by block and do not multiply it out."""
 
 
 class Witness(Law):
-    """Counts its calls and keeps what it was given."""
+    """A law that counts its calls and keeps its arguments."""
 
     def nu(self, block, t, e, e_dot, feed_forward, state):
         state += [1.0, t, *feed_forward[:2]]
@@ -78,7 +78,7 @@ def test_asked_block_by_block_the_linear_law_is_what_its_matrices_are(coupling, 
 
 @pytest.mark.parametrize("tree", [PAPER_TREE, ((None,), (None, (None, None)), None)])
 def test_a_law_of_others_is_in_the_tree_what_it_is_to_all_at_once(tree):
-    """State, weight and time included; a group of a single robot has no shape, and its law is not asked."""
+    """State, weight and time are included.  A group of a single robot has no shape, so the law is not called for it."""
     plan = of_another(random_plan(tree, 5, "multi", 0.5, avoidance=True), Witness())
     central, run = CentralLaw(plan), Watched(plan, 5)
     for time_ns in run.instants:
@@ -110,7 +110,7 @@ def test_the_tree_weighs_coupling_and_avoidance_as_the_law_says():
 
 
 def test_a_law_is_not_asked_while_the_node_hears_too_little():
-    """A state takes 2 ms: until then the node commands nothing, and the law's state stands still."""
+    """States take 2 ms.  Until then the node commands nothing, and the state of the law does not change."""
     plan = of_another(random_plan((None, None), 1, "three", 0.0, avoidance=False, duration=0.004), Witness())
     late = tuple(
         replace(link, delay_min_ns=2_000_000, delay_max_ns=2_000_000) if link.source == 0 else link
@@ -149,7 +149,7 @@ def test_a_law_from_a_file_moves_robots(folder: Path) -> None:
     engine.run()
     moved = [role.state for role in engine.roles if isinstance(role, Robot)]
     assert max(abs(state.v) for state in moved) > 0.05
-    # What another law with the same numbers does is the same.
+    # A law from a file moves the robots as the built-in law with the same numbers does.
     same = load(folder / "mine.toml", ["law={epsilon=[0.5,0.5],gains=[{k1=3.0}]}"])[1]
     other = Engine(replace(same, duration_ns=200_000_000))
     other.run()
@@ -206,7 +206,7 @@ ZERO = np.zeros(4)
 
 
 class Faulty(Law):
-    """Does what a test says."""
+    """A law that fails in the way that a test chooses."""
 
     does: str = ""
 

@@ -1,4 +1,4 @@
-"""The law in the tree, node by node and message by message, against the law of all robots at once."""
+"""The law in the tree, node by node and message by message, against the central law."""
 
 from dataclasses import replace
 
@@ -41,13 +41,13 @@ def test_tree_computes_what_the_central_law_does(tree, seed, time_scales, coupli
     for time_ns in run.instants:
         states = run.states(time_ns)
         expected = central(time_ns * 1e-9, states[:, :2], states[:, 2:4])
-        precision = 1e-9 if use == "terminal_sliding" else 1e-12  # its slope is steep where the error is small
+        precision = 1e-9 if use == "terminal_sliding" else 1e-12  # its slope is steep for small errors
         np.testing.assert_allclose(run.commanded(time_ns), expected, atol=precision * (1 + np.abs(expected).max()))
     assert run.engine.messages == len(run.said)
 
 
 def test_nine_robots_that_avoid_each_other_do_feel_it():
-    """The random trees above mean something only if their forces do."""
+    """Avoidance changes the accelerations of nine robots, so the random trees above do test it."""
     plan = random_plan(PAPER_TREE, 5, "three", 0.5, avoidance=True)
     near = Watched(plan, 5).commanded(0)
     far = Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 5).commanded(0)
@@ -57,7 +57,7 @@ def test_nine_robots_that_avoid_each_other_do_feel_it():
 @SETTINGS
 @given(trees(max_robots=8), SEEDS)
 def test_torque_is_that_of_the_acceleration(tree, seed):
-    """u = B⁻¹(a - A ṗ - C), label 801 literally; the period is so short that nothing turns meanwhile."""
+    """u = B⁻¹(a - A ṗ - C), written as in label 801.  The period is so short that the robot does not turn in it."""
     periods = {"acceleration": 1e-9, "torque": 1e-9}
     plan = random_plan(tree, seed, "three", 0.5, avoidance=True, duration=1e-9, periods=periods)
     run = Watched(plan, seed)
@@ -75,13 +75,14 @@ def test_torque_is_that_of_the_acceleration(tree, seed):
             ]
         )
         C = -d * omega**2 * np.array([c, s])
-        # The half-step lead of 0.5 ns moves it by about 1e-9 of |a| ω.
+        # The lead of 0.5 ns changes the torque by about 1e-9 of |a| ω.
         u = np.linalg.solve(B, a - A @ state[2:4] - C)
         np.testing.assert_allclose(did[[FIELD["tau_right"], FIELD["tau_left"]]], u, rtol=1e-5, atol=1e-5)
 
 
 def test_null_until_every_child_was_heard():
-    """One robot's states take 2 ms: its leader, all above and all below that leader's parent are silent until then."""
+    """The states of one robot take 2 ms.  Until then its leader, the nodes above, and all members below them send null
+    messages."""
     tree = ((None, None), (None, None))
     plan = random_plan(tree, 1, "three", 0.5, avoidance=True, duration=0.004)
     late = tuple(
@@ -96,7 +97,7 @@ def test_null_until_every_child_was_heard():
         assert not run.said[Channel.GROUP_STATE, second, time_ns].is_null
         for channel, source in ((Channel.REFERENCE, root), (Channel.COMMAND, first), (Channel.COMMAND, second)):
             assert run.said[channel, source, time_ns].is_null == silent
-    # Without a command there is no torque, and nothing is counted as saturated.
+    # Without a command the torque is zero, and nothing counts as saturated.
     for time_ns in run.instants[1:3]:
         np.testing.assert_array_equal(run.states(time_ns)[:, FIELD["ax"] :], 0.0)
     assert (run.states(run.instants[3])[:, FIELD["tau_right_peak"]] > 0).all()
@@ -129,7 +130,8 @@ def slow_root(ratio: int, coupling: float, avoidance: bool, ticks: int = 9) -> P
 @pytest.mark.parametrize("ratio", [2, 3])
 @pytest.mark.parametrize("coupling", [0.0, 0.5])
 def test_slow_coordinator_holds_what_it_said(ratio, coupling):
-    """Leaders act every T on what they see; ν of inter and centroid, and what others' rates do, are of the last k T."""
+    """Leaders use states of every T.  ν of inter and centroid, and the error rates of other blocks, are those of the last
+    multiple of k T."""
     plan = slow_root(ratio, coupling, avoidance=False)
     run = Watched(plan, 7)
     cbt, gains = CentralLaw(plan).transformation, [BlockGains.of(plan, block) for block in plan.blocks]
@@ -158,7 +160,7 @@ def test_slow_coordinator_holds_what_it_said(ratio, coupling):
 
 
 def test_slow_coordinator_hands_down_forces_of_its_own_pairs_only():
-    """Within a group robots avoid each other at T; between groups by the forces of the last k T."""
+    """Forces within a group are those of every T; forces between groups are those of the last multiple of k T."""
     plan = slow_root(3, 0.0, avoidance=True)
     run, quiet = Watched(plan, 7), Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 7)
     np.testing.assert_array_equal(run.states(0), quiet.states(0))
@@ -185,7 +187,7 @@ def test_slow_coordinator_hands_down_forces_of_its_own_pairs_only():
 
 
 def _leader_alone(plan: Plan, index: int, run: Watched, time_ns: int, reference: Array) -> Array:
-    """Returns what a leader commands for given states and a given reference where nobody avoids anybody."""
+    """Returns the command of a leader for given states and a given reference, without avoidance."""
     leader = Engine(plan).roles[index]
     node = plan.formation[index]
     leader.stages[0].run(time_ns, [run.said[Channel.STATE, child, time_ns] for child in node.children])
@@ -194,7 +196,7 @@ def _leader_alone(plan: Plan, index: int, run: Watched, time_ns: int, reference:
 
 
 def _forces_within(x: Array) -> Array:
-    """Returns ∇f within a group, pair by pair from the formula of the potential's slope."""
+    """Returns ∇f within a group, computed for each pair from the formula of the potential's slope."""
     f = np.zeros_like(x)
     for i in range(len(x)):
         for j in range(len(x)):

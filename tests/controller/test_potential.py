@@ -1,4 +1,4 @@
-"""The avoidance force against finite differences of the potential, and what holds for any force between pairs."""
+"""The avoidance force against finite differences of the potential, and properties of any force between pairs."""
 
 from dataclasses import replace
 
@@ -17,7 +17,8 @@ def forces(plan: AvoidancePlan = PLAN, robots: int = ROBOTS) -> PairForces:
 
 
 def pair(distance: float, plan: AvoidancePlan = PLAN, angle: float = 0.7) -> Array:
-    """Returns the force on the first of two robots at a distance, along the line from the second to the first."""
+    """Returns the force on the first of two robots at a distance; the line from the second to the first has the angle
+    `angle`."""
     away = np.array([np.cos(angle), np.sin(angle)])
     found = forces(plan, 2)(np.array([distance * away, (0.0, 0.0)]))
     assert found is not None
@@ -27,7 +28,7 @@ def pair(distance: float, plan: AvoidancePlan = PLAN, angle: float = 0.7) -> Arr
 
 
 def configurations(count: int = 20):
-    """Yields positions of robots of which many, but none within 1.2 r_a, sense each other."""
+    """Yields positions of robots: many pairs are within the sensing radius, none within 1.2 r_a."""
     random = np.random.default_rng(7)
     found = 0
     while found < count:

@@ -1,4 +1,4 @@
-"""Terminal sliding mode against its closed loop derived another way, its closed forms, and the linear law's decay."""
+"""Terminal sliding mode against a closed loop derived in another way, against closed forms, and against the linear law."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -21,7 +21,7 @@ from support.trees import ROBOT, plan_of, scenario
 
 
 def least(gamma: float, beta: float) -> float:
-    """Returns the κ above which the surface is reached: the largest (1-u)^ρ u^(1-ρ), in place of its closed form."""
+    """Returns the κ above which the surface is reached, from the largest value of (1-u)^ρ u^(1-ρ), not from the closed form."""
     rho, u = 2 / gamma - 1, np.linspace(0, 1, 100_001)
     return float(((1 - u) ** rho * u ** (1 - rho)).max() * beta ** (2 / gamma) / gamma)
 
@@ -30,7 +30,7 @@ PARAMETERS = [
     (gamma, beta, round(share * least(gamma, beta), 3))
     for gamma, beta, share in product((1.2, 1.5, 1.8), (0.5, 1.0, 2.0), (1.4, 3.0))
 ]
-"""γ, β, κ"""
+"""Triples of γ, β, κ"""
 numbers = st.floats(-20, 20).filter(lambda x: x == 0 or abs(x) > 1e-9)
 
 
@@ -43,13 +43,14 @@ def block(sigma: float = 1.0, T: float = 0.01, lead: float = 0.0, size: int = 1)
 
 
 def answer(law: TerminalSliding, at: Block, e: float, e_dot: float) -> float:
-    """Returns ν of one number, without feed-forward."""
+    """Returns ν of a block with one number, without feed-forward."""
     return float(law.nu(at, 0.0, np.array([e]), np.array([e_dot]), np.zeros(1), np.zeros(0))[0])
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion with σ = 1: integrated until it reaches the surface at (`reached`, e), and along it from there."""
+    """A motion with σ = 1: first a numerical solution until it reaches the surface at the time `reached`, then the motion on
+    the surface."""
 
     off_surface: Any
     reached: float
@@ -64,8 +65,8 @@ class Motion:
 
 
 def motion(gamma: float, beta: float, kappa: float, e: float, rate: float) -> Motion:
-    """Returns the motion of ë = ν, straight from the equation.  Where s = 0, e' = -sig(β e)^(1/γ), and that can be integrated
-    by hand: |e|^(1-1/γ) falls at the rate (1-1/γ) β^(1/γ)."""
+    """Returns the motion of ë = ν from the differential equation.  On s = 0, e' = -sig(β e)^(1/γ) has a closed solution:
+    |e|^(1-1/γ) falls at the rate (1-1/γ) β^(1/γ)."""
 
     def on_it(_, y):
         return abs(y[0] + sig(y[1], gamma) / beta) - 1e-7
@@ -90,7 +91,7 @@ def motion(gamma: float, beta: float, kappa: float, e: float, rate: float) -> Mo
 
 
 def sampled(law: TerminalSliding, at: Block, e: float, ticks: int, e_dot: float = 0.0, w: float = 0.0) -> Array:
-    """Returns (e, ė, ν) tick by tick of a point that does what it is told, but for an acceleration w, (ticks, 3)."""
+    """Returns (e, ė, ν) of a point at each tick, (ticks, 3); its acceleration is ν plus the disturbance w."""
     T, path = at.period_s, []
     for _ in range(ticks):
         nu = answer(law, at, e, e_dot)
@@ -101,8 +102,8 @@ def sampled(law: TerminalSliding, at: Block, e: float, ticks: int, e_dot: float 
 
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS)
 def test_sliding_variable_and_error_are_zero_after_finite_times(gamma, beta, kappa):
-    """|s| only falls, at the pace that the docstring gives; it is zero while the error is not; the error is zero at the end,
-    and so it is of the law's own loop, sampled finely."""
+    """|s| falls at the rate that the law's docstring gives, and is zero before the error is.  At the end the error is zero, and
+    so is that of the law's own loop with a short period."""
     found = motion(gamma, beta, kappa, 1.0, 0.0)
     assert 0 < found.reached < found.end
     assert found.e_reached > 5e-4
@@ -121,14 +122,14 @@ def test_sliding_variable_and_error_are_zero_after_finite_times(gamma, beta, kap
 
 @pytest.mark.parametrize(("gamma", "beta"), [(1.2, 1.0), (1.5, 2.0), (1.8, 0.5)])
 def test_below_its_least_kappa_the_surface_is_not_reached_and_so_it_is_refused(gamma, beta):
-    """There e' = -c e^(1/γ) with a smaller c than the surface's solves the equation of motion: it is in the way."""
+    """A curve e' = -c e^(1/γ) with a smaller c than the surface's solves the equation of motion; motions cannot cross it."""
     for share in (0.5, 0.999):
         with pytest.raises(ValueError, match="else no surface is reached"):
             TerminalSliding(gamma=gamma, beta=beta, kappa=share * least(gamma, beta))
     TerminalSliding(gamma=gamma, beta=beta, kappa=1.001 * least(gamma, beta))
     kappa = 0.5 * least(gamma, beta)
 
-    def miss(c):  # of e'' = (c²/γ) e^(2/γ-1), over e^(2/γ-1)
+    def miss(c):  # the residual of e'' = (c²/γ) e^(2/γ-1), divided by e^(2/γ-1)
         s = 1 - c**gamma / beta
         return c**2 / gamma - beta / gamma * c ** (2 - gamma) + kappa * s ** (2 / gamma - 1)
 
@@ -141,7 +142,7 @@ def test_below_its_least_kappa_the_surface_is_not_reached_and_so_it_is_refused(g
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS)
 @pytest.mark.parametrize("start", [0.2, 3.0])
 def test_time_on_the_surface_is_the_closed_form(gamma, beta, kappa, start):
-    """From e_0 with e' = -(β e_0)^(1/γ) the law's own loop stays on the surface and ends when the closed form says."""
+    """From e_0 with e' = -(β e_0)^(1/γ) the law's own loop stays on the surface, and ends at the time of the closed form."""
     expected = gamma / (gamma - 1) * beta ** (-1 / gamma) * start ** (1 - 1 / gamma)
     law = TerminalSliding(gamma=gamma, beta=beta, kappa=kappa)
     T = expected / 3000
@@ -150,14 +151,14 @@ def test_time_on_the_surface_is_the_closed_form(gamma, beta, kappa, start):
     assert np.abs(s).max() < 1e-2 * start
     over = np.flatnonzero(np.abs(path[:, 0]) > 1e-9 * start)[-1]
     assert over * T < 1.05 * expected
-    # Ten per cent before the end there is left what |e|^(1-1/γ), falling evenly, says.
+    # |e|^(1-1/γ) falls at a constant rate, so at 90 % of the time a tenth of it is left.
     left = start * 0.1 ** (gamma / (gamma - 1))
     assert path[2700, 0] == pytest.approx(left, rel=0.05, abs=1e-4 * start)
 
 
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS)
 def test_times_are_in_proportion_to_a_power_of_the_start(gamma, beta, kappa):
-    """From rest at c^γ e_0 it takes c^(γ-1) times as long: the motion is homogeneous."""
+    """The motion is homogeneous, so from rest at c^γ e_0 it takes c^(γ-1) times as long."""
     one, other = (motion(gamma, beta, kappa, start, 0.0) for start in (1.0, 5.0**gamma))
     assert other.end == pytest.approx(5.0 ** (gamma - 1) * one.end, rel=1e-4)
     t = np.linspace(0, 0.99 * one.end, 50)
@@ -166,7 +167,8 @@ def test_times_are_in_proportion_to_a_power_of_the_start(gamma, beta, kappa):
 
 
 def test_finite_against_exponential_in_numbers():
-    """From rest at 1 m, in units of σ: the linear law with K_f1 = K_f2 = 1 has an error long after it is gone here."""
+    """From rest at 1 m, times in units of σ: the linear law with K_f1 = K_f2 = 1 has an error long after that of terminal
+    sliding is zero."""
     assert motion(1.5, 1.0, 1.0, 1.0, 0.0).end == pytest.approx(3.74, abs=0.01)
 
     def linear(t):  # e'' = -e' - e from (1, 0)
@@ -175,7 +177,7 @@ def test_finite_against_exponential_in_numbers():
 
     path = np.abs(sampled(TerminalSliding(), block(T=0.01, lead=1.0), 1.0, 1301)[:, 0])
     for t, slow, gone in ((4.0, 0.09, 1e-9), (8.0, 0.01, 1e-11), (13.0, 4e-4, 1e-12)):
-        assert np.abs(linear(np.linspace(t, t + 3.7, 400))).max() > slow  # 3.7 is one swing
+        assert np.abs(linear(np.linspace(t, t + 3.7, 400))).max() > slow  # 3.7 is one oscillation
         assert path[round(100 * t)] < gone
 
 
@@ -187,7 +189,7 @@ def test_a_constant_acceleration_leaves_what_the_docstring_says(gamma, beta, kap
     assert abs(kept) < 3
     at = block(sigma, 0.001)
     assert sampled(law, at, kept, 5000, w=w)[-2:, 0].mean() == pytest.approx(kept, rel=0.02, abs=1e-4)
-    for start in (kept - 0.1, kept + 0.1):  # it creeps there
+    for start in (kept - 0.1, kept + 0.1):  # the error slowly approaches `kept`
         later = sampled(law, at, start, 20_000, w=w)[[9_999, -1], 0]
         assert np.abs(later - kept)[1] < 1e-4 + 0.9 * np.abs(later - kept)[0] < 0.1
 
@@ -195,7 +197,7 @@ def test_a_constant_acceleration_leaves_what_the_docstring_says(gamma, beta, kap
 @settings(derandomize=True, deadline=None, max_examples=200)
 @given(numbers, numbers, st.sampled_from(PARAMETERS), st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.05, 1.0))
 def test_symmetric_and_scaled_by_its_time(e, e_dot, parameters, lead, sigma):
-    """ν(-e, -ė) = -ν; ν of a block with σ and period σ T is that of σ = 1 and T at (e, σ ė), over σ²."""
+    """ν(-e, -ė) = -ν(e, ė).  For σ and the period σ T, ν(e, ė) is that for σ = 1 and T at (e, σ ė), divided by σ²."""
     law = TerminalSliding(**dict(zip(("gamma", "beta", "kappa"), parameters, strict=True)))
     at = block(sigma, 0.02 * sigma, lead)
     nu = answer(law, at, e, e_dot)
@@ -206,7 +208,7 @@ def test_symmetric_and_scaled_by_its_time(e, e_dot, parameters, lead, sigma):
 @settings(derandomize=True, deadline=None, max_examples=300)
 @given(numbers, numbers, st.sampled_from(PARAMETERS), st.sampled_from([0.25, 0.5, 1.0]), st.floats(0.001, 2.0))
 def test_look_ahead_solves_its_equation(e, e_dot, parameters, lead, T):
-    """σ² η = f(e + h ė + h²/2 η, σ (ė + h η)) with σ = 1, by another way to find its root."""
+    """The equation σ² η = f(e + h ė + h²/2 η, σ (ė + h η)) with σ = 1, solved by another root finder."""
     gamma, beta, kappa = parameters
     law, h = TerminalSliding(gamma=gamma, beta=beta, kappa=kappa), lead * T
 
@@ -221,7 +223,7 @@ def test_look_ahead_solves_its_equation(e, e_dot, parameters, lead, T):
 
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS)
 def test_what_remains_of_a_held_loop_is_the_closed_form(gamma, beta, kappa):
-    """e = 0 at the ticks and e' = ±a from tick to tick.  It is a motion of the loop, and what remains where it is reached."""
+    """e = 0 at all ticks, while e' = ±a alternates.  This is a motion of the loop, and runs that reach it stay in it."""
     law, sigma, T = TerminalSliding(gamma=gamma, beta=beta, kappa=kappa), 0.5, 0.01
     a = (T / (2 * sigma) * (beta / gamma + kappa * beta ** (1 - 2 / gamma))) ** (1 / (gamma - 1))
     assert answer(law, block(sigma, T), 0.0, a / sigma) == pytest.approx(-2 * a / (T * sigma), rel=1e-9)
@@ -240,7 +242,8 @@ def test_look_ahead_takes_the_chatter_away():
 
 
 def test_runs_tend_to_the_continuous_motion_as_the_period_falls():
-    """Two robots of the paper's plant, their shape and their centroid on different time scales; each number on its own."""
+    """Two robots with the paper's plant; shape and centroid have different time scales.  Each number is compared with its own
+    motion."""
     off = []
     for period in (0.04, 0.02, 0.01):
         table = scenario(

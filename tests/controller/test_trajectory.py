@@ -1,4 +1,4 @@
-"""Trajectories: derivatives by finite differences, waypoints met at rest, least jerk by minimising it."""
+"""Trajectories: derivatives against finite differences, waypoints at rest, minimum jerk against numerical minimisation."""
 
 import numpy as np
 import pytest
@@ -78,13 +78,14 @@ def test_waypoints_go_straight_and_never_back():
 
 
 def test_a_leg_has_least_jerk():
-    """Of all polynomials of degree 9 from rest to rest, ∫ jerk² is least for ours (it is 720 for a unit leg)."""
+    """Of all polynomials of degree 9 from rest to rest, ours has the smallest ∫ jerk², which is 720 for a unit leg."""
     trajectory = TRAJECTORIES["waypoints"](points=[(0.0, 0.0), (1.0, 0.0)], times=[0.0, 1.0])
     nodes, weights = np.polynomial.legendre.leggauss(12)
     nodes, weights = (nodes + 1) / 2, weights / 2
 
     def position(free):
-        """s⁴-to-s⁹-polynomial with a cubic start: coefficients of s³..s⁵ follow from the three conditions at s = 1."""
+        """Returns the polynomial of s³ to s⁹: `free` are coefficients of s⁶ to s⁹; the others follow from the conditions at
+        s = 1."""
         high = np.array([*free])
         powers = np.arange(6, 6 + len(high))
         known = np.array([1 - high.sum(), -(high * powers).sum(), -(high * powers * (powers - 1)).sum()])

@@ -1,4 +1,4 @@
-"""The centroid-based transformation against the paper's matrix, its definitions and invariants."""
+"""The centroid-based transformation against the paper's matrix, its definitions and its invariants."""
 
 from math import sqrt
 
@@ -44,7 +44,7 @@ def test_node_matrix_refuses_what_is_no_weight(weights):
 
 
 def paper_matrix() -> Array:
-    """Returns Φ_M of section IV as printed, rows z_11 z_12 z_21 z_22 z_31 z_32 z_r1 z_r2 z_c, columns p_1..p_9."""
+    """Returns Φ_M of the paper's section IV as printed: rows z_11, z_12, z_21, z_22, z_31, z_32, z_r1, z_r2, z_c."""
     a, h, t = 1 / sqrt(2), 1 / 2, 1 / 3
     mu_1, mu_2, mu_3 = np.repeat(np.eye(3), 3, axis=1) * t
     return np.array(
@@ -84,7 +84,7 @@ def test_desired_shape_is_that_of_the_points_or_as_given():
 
 
 def walked(tree: Tree, x: Array, first: int = 0) -> tuple[list[Array], Array, int]:
-    """Returns shape variables of a tree in block order, its centroid and its robots' count, by walking it."""
+    """Returns the shape variables of a tree in the order of blocks, its centroid and its number of robots, by walking it."""
     rows: list[Array] = []
     at, places, weights = first, [], []
     for child in sorted(tree, key=lambda child: child is not None):

@@ -1,4 +1,4 @@
-"""Layouts of messages in random trees: against what roles really say, and against the law of all robots at once."""
+"""Layouts of messages in random trees: against the messages that roles send, and against the central law."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -25,14 +25,14 @@ def made(tree, coupling: float, avoidance: bool, path: str = "mirror") -> Plan:
 
 
 def robots_below(plan: Plan, index: int) -> list[int]:
-    """Returns the robots at or below a member, found by walking down."""
+    """Returns the robots at or below a member, found by walking down the tree."""
     if index < len(plan.robots):
         return [index]
     return [robot for child in plan.formation[index].children for robot in robots_below(plan, child)]
 
 
 def nodes_below(plan: Plan, index: int) -> list[int]:
-    """Returns the nodes at or below a member, each after those below it, found by walking down."""
+    """Returns the nodes at or below a member, each after the nodes below it, found by walking down the tree."""
     if index < len(plan.robots):
         return []
     return [*(node for child in plan.formation[index].children for node in nodes_below(plan, child)), index]
@@ -41,7 +41,7 @@ def nodes_below(plan: Plan, index: int) -> list[int]:
 @SETTINGS
 @given(trees(max_robots=8), st.sampled_from(["mirror", "closed"]), COUPLINGS, st.booleans())
 def test_what_may_be_said_is_what_is_said(tree, path, coupling, avoidance):
-    """Not a channel more or less, and as many values as announced."""
+    """Roles send on exactly the channels of the layout, with the numbers of values of the layout."""
     plan = made(tree, coupling, avoidance, path)
     said: list[Message] = []
     Engine(plan, said.append).run()
@@ -70,7 +70,7 @@ def test_parts_stand_side_by_side_and_fill_the_message(tree, coupling, avoidance
             rows.append((command.size, [command.accelerations]))
         for size, parts in rows:
             assert [at for part in parts for at in range(part.start, part.stop)] == list(range(size))
-        # All of a node's own state is made: by the law, by the children, and at the root by the trajectory.
+        # Every value of a node's state has one source: the law, the children, or at the root the trajectory.
         made_of = [state.centroid, state.own_rates, state.centroid_rates, *(part.here for part in layout.carried)]
         assert sorted(at for part in made_of for at in range(part.start, part.stop)) == list(range(state.size))
 
@@ -83,7 +83,7 @@ def test_parts_hold_what_their_names_say(tree, coupling, avoidance):
     Engine(plan, lambda message: said.setdefault((message.source, message.channel), message.values)).run()
     states = np.array([said[robot.index, Channel.STATE] for robot in plan.robots])
     central = CentralLaw(plan)
-    rates = central.transformation.forward(states[:, 2:4])  # the velocities: nothing desired moves but the centroid
+    rates = central.transformation.forward(states[:, 2:4])  # these are the velocities: only the desired centroid moves
     rates[-1] -= central.trajectory.at(0.0)[1]
     block_of = {block.node: at for at, block in enumerate(plan.blocks)}
     starts = np.cumsum([0, *(block.size // 2 for block in plan.blocks)])
@@ -112,7 +112,8 @@ def test_parts_hold_what_their_names_say(tree, coupling, avoidance):
 
 
 def _check_part_of(plan: Plan, parent: NodePlan, child: NodePlan, said: dict[tuple[int, Channel], np.ndarray]) -> None:
-    """A group's centroid is accelerated as its parent said, whatever the group does within; forces are of its own robots."""
+    """Checks that the group's centroid has the acceleration that the parent sent, and that forces are those of its own
+    robots."""
     mine, reference = NodeLayout.of(plan, child).mine, NodeLayout.of(plan, parent).reference
     values = said[parent.index, Channel.REFERENCE]
     given_to = {robot.index: said[robot.parent, Channel.COMMAND][acceleration_of(robot)] for robot in plan.robots}

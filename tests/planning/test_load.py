@@ -1,4 +1,4 @@
-"""What is said of mistakes in a scenario: tables of mistakes with their lines, and mutations that nobody thought of."""
+"""Lines about mistakes in a scenario: tables of mistakes with their lines, and random mutations of scenarios."""
 
 import copy
 import math
@@ -47,7 +47,7 @@ JARGON = ("Input", "constrained", "union", "tagged", "items", "function-", "Valu
 
 
 def said(text: str, *overrides: str) -> str:
-    """Returns the line that a scenario's mistake gives, or an empty one if there is none."""
+    """Returns the line about the mistake in a scenario, or an empty string if there is no mistake."""
     try:
         parse(text, "t.toml", overrides)
     except ScenarioError as error:
@@ -306,7 +306,7 @@ def test_of_several_entries_one_must_be_named(rules, says):
 
 
 def lines(text: str, *overrides: str) -> list[str]:
-    """Returns the lines that a scenario's mistakes give."""
+    """Returns the lines about the mistakes in a scenario."""
     with pytest.raises(ScenarioError) as caught:
         parse(text, "t.toml", overrides)
     return str(caught.value).splitlines()
@@ -343,7 +343,7 @@ def test_what_all_robots_inherit_is_told_once():
         f"t.toml: formation.robots.a.mass: {missing}",
         f"  formation.robots.a.arm: {missing}",
     ]
-    # What the tree itself has wrong comes first.
+    # Mistakes in the tree come first.
     heavy = lines(BASE, "robot.inertia=0.1", "formation.shape={kind='triangle',side=1}", "periods.torque=0.003")
     assert [line.rpartition(" = ")[0].rpartition(" ")[2] for line in heavy[:2]] == [
         "periods.acceleration", "formation.shape.kind",
@@ -446,7 +446,7 @@ def test_texts_are_plain_english():
     assert not [text for text in TEXTS.values() for word in JARGON if word in text]
 
 
-# Mutations: whatever is in a file, it is a scenario or it is explained
+# Mutations: any text is either a scenario, or its mistakes are explained
 
 keys = st.text(min_size=1, max_size=8) | st.sampled_from(
     ["kind", "[key]", "delay", "line", "a number", "an array", "x y"]
@@ -473,13 +473,13 @@ values: st.SearchStrategy[Any] = st.recursive(
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Returns the paths to everything in a table."""
+    """Returns the paths to all values in a table, at any depth."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [place for key, item in inner for place in places(item, (*path, key))] + ([path] if path else [])
 
 
 def is_number(value: Any, path: tuple[Any, ...]) -> bool:
-    """True if a number stands at a path, one that can be multiplied."""
+    """True if the value at a path is a number (and not a bool)."""
     for key in path:
         value = value[key]
     return isinstance(value, float | int) and not isinstance(value, bool) and abs(value) < 10**300
@@ -487,7 +487,7 @@ def is_number(value: Any, path: tuple[Any, ...]) -> bool:
 
 @st.composite
 def mutated(draw: st.DrawFn) -> str:
-    """A shipped scenario with a few things deleted, renamed, replaced or added, as TOML text."""
+    """Returns a shipped scenario as TOML text, with a few keys or values deleted, renamed, replaced or added."""
     table = copy.deepcopy(TABLES[draw(st.sampled_from(sorted(TABLES)))])
     for _ in range(draw(st.integers(1, 2))):
         how = draw(st.sampled_from(["delete", "rename", "replace", "insert", "nudge", "nudge"]))
@@ -507,7 +507,7 @@ def mutated(draw: st.DrawFn) -> str:
                 at[draw(keys)] = draw(values)
             case "nudge":
                 factor = draw(st.sampled_from([-1, 0, 2, 10, 1e-3, 1e9, 1e300]))
-                with suppress(OverflowError):  # of an integer that no float can hold
+                with suppress(OverflowError):  # an integer too large for a float
                     at[last] *= factor
             case _:
                 at[last] = draw(values)
@@ -515,7 +515,8 @@ def mutated(draw: st.DrawFn) -> str:
 
 
 def check(text: str, *overrides: str) -> bool:
-    """Checks that a text is a scenario, or is explained in plain lines, of which the first names the file."""
+    """Checks that a text is a scenario, or that its mistakes are explained in plain lines; the first line names the file.
+    Returns True if it is a scenario."""
     try:
         parse(text, "some file.toml", overrides)
     except ScenarioError as error:
@@ -526,7 +527,7 @@ def check(text: str, *overrides: str) -> bool:
         for line in lines:
             assert len(line) < 1000
             assert line.isprintable()
-            # Beyond what the user wrote there is none of the library's own words.
+            # Apart from the user's own text, no line has words of pydantic.
             for word in ("Input should", "constrained", "function-", "validation", "Value error"):
                 assert word not in line or any(word in written for written in (text, *overrides))
         return False
@@ -544,7 +545,7 @@ def test_mutated_scenarios_load_or_are_explained(text):
 
 
 def override_keys() -> list[str]:
-    """Returns the keys that an override could plausibly name."""
+    """Returns keys that an override may name, as users write them."""
     found = {".".join(map(str, path)) for table in TABLES.values() for path in places(table)}
     more = [
         "links.0.delay",

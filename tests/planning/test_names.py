@@ -1,4 +1,4 @@
-"""What names with hyphens become: keys, processes and files take them as they are, ROS and DBC get underscores."""
+"""Names with hyphens: keys, processes and files keep the hyphens; ROS topics and DBC identifiers have underscores."""
 
 import re
 from pathlib import Path
@@ -35,7 +35,7 @@ robots = { r-1 = { start = [0, -1] } }
 
 
 def plain(text: str) -> str:
-    """Returns a scenario with underscores for hyphens in its names."""
+    """Returns a text with underscores in place of hyphens."""
     return re.sub(r"(?<=[a-z])-(?=[a-z0-9])", "_", text)
 
 

@@ -26,7 +26,7 @@ robot = { mass = 10.0, inertia = 0.5, wheel_radius = 0.1, arm = 0.4, offset = 0.
 
 
 def grouped(*sizes: int, extra: str = "", epsilon: str = "[0.1, 0.1]") -> str:
-    """Returns a scenario with groups of so many robots, in lines."""
+    """Returns a scenario with groups of these numbers of robots; the robots of a group are in a line."""
     text, x = HEAD + extra, 0
     if "[law]" not in extra:
         text += f"\n[law]\nepsilon = {epsilon}\n"
@@ -51,7 +51,7 @@ def paper(*overrides: str) -> Plan:
 
 
 def refusal(text: str, *overrides: str) -> str:
-    """Returns what is said about a scenario that is refused, without file and overrides."""
+    """Returns the text of the error about a scenario that is refused, without the file and the overrides."""
     with pytest.raises(ScenarioError) as caught:
         parse(text, "t.toml", overrides)
     return re.sub(r"^t\.toml( with --set .*?)?: ", "", str(caught.value))
@@ -288,7 +288,7 @@ def test_three_time_scales(groups):
 
 @pytest.mark.parametrize("m", [1, 2, 3, 5, 8])
 def test_multi_time_scales(m):
-    """theory.md section 3: inter ε1, group j: σ_j = ε1 ε2 ··· ε_{m+2−j}."""
+    """docs/architecture.md, 2.4: the inter block has ε_1, group j has σ_j = ε_1 ε_2 … ε_{m+2−j}."""
     epsilon = [1 / (k + 2) for k in range(m + 1)]
     plan = plan_of(grouped(*[2] * m, extra=f'[law]\ntime_scales = "multi"\nepsilon = {epsilon}\n'))
     sigma = {block.name: block.sigma for block in plan.blocks}
@@ -463,7 +463,7 @@ def test_many_members_are_not_all_listed():
 
 
 def matches_by_force(pattern: str, path: str) -> bool:
-    """Tries every length that each `**` could stand for."""
+    """Returns whether a path matches, by trying every number of chunks that each `**` can stand for."""
     wants, chunks = pattern.split("/"), path.split("/")
     wild = [at for at, want in enumerate(wants) if want == "**"]
     for lengths in product(range(len(chunks) + 1), repeat=len(wild)):

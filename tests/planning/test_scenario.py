@@ -41,7 +41,7 @@ def digest(plan: Plan) -> str:
 
 
 def check_round_trip(scenario: Scenario, plan: Plan) -> None:
-    """Checks that the effective scenario, read again, is the same, with the same plan, and says itself again."""
+    """Checks that the effective scenario, read again, gives the same scenario, the same plan and the same text."""
     text = effective_toml(scenario)
     again, plan_again = parse(text, "effective.toml")
     assert again == scenario

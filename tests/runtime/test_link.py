@@ -23,7 +23,7 @@ seeds = st.integers(0, 2**63 - 1)
 
 
 def made(plan: LinkPlan = UNIFORM, seed: int = 1, source: str = "g1/r1", receiver: str = "g1") -> Link:
-    """Returns a link that has not been asked anything."""
+    """Returns a new link."""
     return Link(plan, seed, source, receiver)
 
 
@@ -39,7 +39,7 @@ GOLDEN_FAR = 2986681
 
 
 def test_golden_keys_and_draws():
-    """Numbers written down, so that a change of the generator, of the key or of the order of draws is noticed."""
+    """Golden numbers, so that a change of the generator, of the key or of the order of draws is noticed."""
     assert link_key(1, "g1/r1", "g1", Channel.STATE) == GOLDEN_KEY
     assert draws(GOLDEN_KEY, 0)[:3].tolist() == GOLDEN_DRAWS
     assert draws(GOLDEN_KEY, 7)[511].tolist() == GOLDEN_LATER
@@ -74,7 +74,7 @@ def test_fates_asked_in_between_change_nothing(plan, seed):
 
 
 def modelled(plan: LinkPlan, seed: int, time_ns: int) -> tuple[int, int, int, int, int]:
-    """Returns newest, sent, delivered, lost, in flight at an instant, counted afresh from the fates."""
+    """Returns newest, sent, delivered, lost and in flight at an instant, counted from the fates of all messages."""
     link, newest, delivered, lost, flying = made(plan, seed), -1, 0, 0, 0
     sent = time_ns // plan.period_ns + 1
     for number in range(sent):
@@ -98,7 +98,7 @@ def test_newest_and_counts_are_those_of_the_model_at_every_instant(plan, seed, i
         found = newest, counts.sent, counts.delivered, counts.lost, counts.in_flight
         assert found == modelled(plan, seed, time_ns)
         assert counts.sent == counts.delivered + counts.lost + counts.in_flight
-        assert link.newest(time_ns) == newest  # asking twice changes nothing
+        assert link.newest(time_ns) == newest  # a second call changes nothing
 
 
 @given(plans, seeds, st.integers(0, 100), st.integers(0, 400))
@@ -158,7 +158,7 @@ def test_losses_are_as_frequent_as_the_scenario_says(loss):
     lost = np.array([link.fate(number) is None for number in range(count)])
     spread = np.sqrt(loss * (1 - loss) / count)
     assert abs(lost.mean() - loss) < 4 * spread
-    # Independent in time: as often after a loss as otherwise.
+    # Independence in time: losses are as frequent after a loss as otherwise.
     assert abs(lost[1:][lost[:-1]].mean() - loss) < 4 * np.sqrt(loss * (1 - loss) / lost.sum())
 
 

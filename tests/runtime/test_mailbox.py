@@ -20,7 +20,7 @@ RECEIVER = 9
 
 
 def mailbox_of(links: Sequence[LinkPlan], seed: int = 1, stages: Sequence[Stage] | None = None) -> Mailbox:
-    """Returns the mailbox of a role that hears every link in each of its stages."""
+    """Returns the mailbox of a role whose stages each have all links as inputs."""
     inputs = tuple(Input(link.source, link.channel) for link in links)
     stages = stages or [Stage(Turn.ACT, PERIOD, inputs, lambda time_ns, heard: ())]
     plan: Any = SimpleNamespace(
@@ -33,13 +33,13 @@ def mailbox_of(links: Sequence[LinkPlan], seed: int = 1, stages: Sequence[Stage]
 
 
 def message_of(link: LinkPlan, number: int, silent: int = 0) -> Message:
-    """Returns message `number` of a link; the first `silent` have nothing to say."""
+    """Returns message `number` of a link; the first `silent` ones are null messages."""
     values = NULL if number < silent else np.array([float(link.source), float(number)])
     return Message(link.channel, link.source, number, number * link.period_ns, values)
 
 
 def number_in_use(link: LinkPlan, seed: int, time_ns: int) -> int:
-    """The newest that is not lost and has arrived, found by looking at every message there is."""
+    """Returns the number of the newest message that is not lost and has arrived, by looking at all messages."""
     model = Link(link, seed, f"m{link.source}", f"m{RECEIVER}")
     sent = range(time_ns // link.period_ns + 1)
     return max((number for number in sent if model.arrived(number, time_ns)), default=-1)
@@ -63,7 +63,7 @@ TICKS = 25
 
 @given(links_strategy, seeds, st.integers(0, 3), st.randoms(use_true_random=False))
 def test_every_interleaving_is_heard_alike(links, seed, silent, shuffle):
-    """Messages come in any order, as late as can be or long before their time, some twice."""
+    """Messages come in any order, as late as possible or long before they are used, some twice."""
     mailbox = mailbox_of(links, seed)
     on_the_way = [message_of(link, number, silent) for link in links for number in range(TICKS)]
     on_the_way += shuffle.sample(on_the_way, 5)
@@ -102,7 +102,7 @@ def test_what_is_missing_is_exactly_the_message_in_use(links, seed):
 
 @given(links_strategy, seeds, st.randoms(use_true_random=False))
 def test_on_a_wall_clock_the_newest_that_came_is_used(links, seed, luck):
-    """Some messages come late, some never: heard is the newest that has come and that the link lets arrive."""
+    """Some messages come late, some never.  In use is the newest that has come and has arrived by the rules of the link."""
     mailbox = mailbox_of(links, seed)
     comes = {
         (link.source, number): number * link.period_ns + luck.choice([0, 0, 0, PERIOD, 5 * PERIOD, 10**9])
@@ -133,7 +133,7 @@ def test_a_late_message_is_used_though_a_newer_one_is_wanted():
     mailbox.deliver(message_of(link, 0))
     for time_ns in (0, PERIOD, 2 * PERIOD):
         mailbox.take(0, time_ns)
-    mailbox.deliver(message_of(link, 1))  # number 2 is wanted since the last instant, and has not come
+    mailbox.deliver(message_of(link, 1))  # number 2 should be in use since the last instant, but has not come
     (heard,) = mailbox.take(0, 2 * PERIOD)
     assert heard is not None
     assert heard.sequence == 1
@@ -151,7 +151,7 @@ def test_a_message_from_the_future_waits_for_its_instant():
 
 
 def held_messages(mailbox: Mailbox) -> int:
-    """Returns how many messages a mailbox keeps."""
+    """Returns the number of messages that a mailbox holds."""
     return sum(len(slot.newer) + (slot.current is not None) for slot in mailbox._slots.values())
 
 
@@ -168,7 +168,7 @@ def test_memory_is_bounded_however_much_is_lost(loss, delay):
 
 
 def test_memory_is_bounded_when_nothing_in_use_comes():
-    """A wall clock: every third message comes, out of order."""
+    """On a wall clock, every third message comes, out of order."""
     links = [LinkPlan(source, RECEIVER, Channel.STATE, PERIOD, 0, 30 * source, 0.1 * source) for source in range(3)]
     mailbox, luck, most = mailbox_of(links), random.Random(1), 0
     for number in range(3000):

@@ -1,4 +1,4 @@
-"""The runner moves its role as the in-process engine would, whatever comes when, and tells what goes wrong."""
+"""The runner moves its role as the in-process engine does, whatever the order of messages, and reports errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LOST = 'links=[{channel="command",receiver="g1/*",loss=1.0},{channel="group_stat
 
 
 class Network:
-    """Sessions in memory.  What is put waits, per sender and receiver in order, until it is delivered."""
+    """Sessions in memory.  A payload waits in a queue for its sender and receiver until it is delivered."""
 
     def __init__(self) -> None:
         self.receivers: dict[str, list[tuple[str, Receive]]] = {}
@@ -63,7 +63,7 @@ class Network:
         return SimpleNamespace(subscribe=subscribe, publisher=publisher)
 
     def deliver(self, choose: random.Random, done: Callable[[], bool]) -> None:
-        """Delivers in bursts, of a sender and a receiver drawn each time, until `done`."""
+        """Delivers bursts of payloads until `done`; the sender and the receiver of each burst are random."""
         while True:
             with self.changed:
                 assert self.changed.wait_for(lambda: done() or any(self.queues.values()), TIMEOUT_S), "all stand still"
@@ -76,7 +76,7 @@ class Network:
 
 
 class Member:
-    """A runner alone, with the test for its network: `said` is what it put, `batches` what it put for watchers."""
+    """A single runner; the test is its network.  `said` are the payloads that it sends, `batches` the batches of copies."""
 
     def __init__(self, plan: Plan, role: Role, *, virtual: bool = True) -> None:
         self.said: list[bytes] = []
@@ -128,13 +128,13 @@ class Member:
         assert not self.thread.is_alive()
 
     def watched(self) -> list[bytes]:
-        """Returns the messages that watchers got."""
+        """Returns the messages in the batches of copies."""
         return [payload for batch in self.batches for payload in split(batch)]
 
 
 @cache
 def plan_and_digest(name: str, *overrides: str) -> tuple[Plan, str]:
-    """Returns a plan, and the digest of its trace in one process."""
+    """Returns a plan, and the digest of its run in one process."""
     plan = plan_of(name, *overrides)
     return plan, trace_of(plan).digest()
 
@@ -208,7 +208,7 @@ def test_a_stall_names_whom_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> Non
             for payload in of(messages, plan.root.index, Channel.REFERENCE)[:2]:
                 member.receive(payload)
         else:
-            member.runner.stop()  # ends it at its next wait
+            member.runner.stop()  # the runner ends when it next waits
 
     member.on_wait = on_wait
     member.thread.start()
@@ -239,7 +239,7 @@ def test_garbage_is_counted_and_dropped() -> None:
                 member.receive(encode(message._replace(values=misshapen)))
                 shapeless += 1
         member.receive(command)
-        member.receive(command)  # twice is once
+        member.receive(command)  # the second copy changes nothing
     member.join()
     assert member.failure is None
     assert sum(member.runner.counts.refused.values()) == 5 * len(commands) + shapeless
@@ -257,7 +257,7 @@ def test_a_watcher_that_takes_nothing_holds_the_role_back_and_loses_nothing(monk
     member.watch_gate.clear()
     member.thread.start()
     for command in of(messages, robot.parent, Channel.COMMAND):
-        member.receive(command)  # which waits for nobody
+        member.receive(command)  # returns at once
     assert member.at_gate.wait(TIMEOUT_S)
     per_batch = 1 + 1000 // len(states[0])
     assert len(member.said) <= (MAX_BATCHES + 1) * per_batch
@@ -342,7 +342,7 @@ def test_an_exception_in_a_stage_reaches_the_caller(at: int) -> None:
 
 
 class Clock:
-    """Stands for the module `time`: sleeping and waiting move it, nothing else does."""
+    """Takes the place of the module `time`.  Only sleeping and waiting move the clock."""
 
     def __init__(self) -> None:
         self.now_ns = 0
@@ -353,8 +353,8 @@ class Clock:
 
 
 def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int | None], Runner]:
-    """Runs a robot's stages on a wall clock with commands that come `delay_of(number)` [ns] after their instant, or
-    never; returns by instant the number of the command it used."""
+    """Runs a robot's stages on a wall clock.  Command `number` comes `delay_of(number)` [ns] after its instant, or never if
+    that is None.  Returns the number of the command that the robot uses at each instant."""
     plan, messages = story()
     robot = plan.robots[0]
     start_ns = 1_000_000_000
@@ -377,7 +377,7 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int 
     coming = deque(sorted(payloads, key=lambda each: each[0]))
 
     def rest(runner: Runner, until_ns: int) -> None:
-        """Lets time pass until something comes, which the handler takes, or to the end."""
+        """Lets time pass until a command comes, which the handler takes, or until `until_ns`."""
         if coming and coming[0][0] <= max(until_ns, clock.now_ns):
             came_ns, payload = coming.popleft()
             clock.now_ns = max(clock.now_ns, came_ns)
@@ -406,7 +406,7 @@ def test_on_a_clock_nothing_late_is_nothing_counted() -> None:
 def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
     plan = story()[0]
     instants = plan.duration_ns // plan.robots[0].period_ns + 1
-    stopped = range(100, 120)  # its leader stands still, and then catches up
+    stopped = range(100, 120)  # the leader stands still, then sends all at once
     period_ns = plan.robots[0].period_ns
 
     def delay_of(number: int) -> int | None:
@@ -420,7 +420,7 @@ def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
     wanted[stopped.start : stopped.stop] = [stopped.start - 1] * len(stopped)
     assert numbers == wanted
     assert runner.counts.late == 1 + len(stopped)
-    assert runner.counts.latest_ns == 0  # it ran at its deadline, not after
+    assert runner.counts.latest_ns == 0  # stages ran at their deadline, not after it
 
 
 def test_keys_of_what_a_member_hears() -> None:

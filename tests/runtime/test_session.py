@@ -1,4 +1,4 @@
-"""The session: payloads arrive whole and in order, tokens tell who is there, nobody waits for whom it should not."""
+"""The session: payloads arrive whole and in order, tokens show which processes are alive, and only lockstep blocks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 def pair(stack: ExitStack, *, lockstep: bool = True, endpoint: str | None = None) -> tuple[Session, Session]:
-    """Return two sessions linked to each other; the first listens."""
+    """Returns two sessions that are connected to each other; the first listens."""
     endpoints = [endpoint] if endpoint else loopback_endpoints(1)
     first = stack.enter_context(Session(listen=endpoints, connect=[], lockstep=lockstep))
     second = stack.enter_context(Session(listen=[], connect=endpoints, lockstep=lockstep))
@@ -37,13 +37,13 @@ def pair(stack: ExitStack, *, lockstep: bool = True, endpoint: str | None = None
 
 
 def ready(receiver: Session, sender: Session) -> None:
-    """Wait until the sender knows all that the receiver has declared."""
+    """Waits until the sender knows all that the receiver has declared."""
     receiver.declare_token("run/@alive/receiver")
     assert awaited(sender, "run/@alive/receiver") == set()
 
 
 def taken(inbox: Inbox, count: int) -> list[bytes]:
-    """Return what comes into an inbox: `count` payloads, or those that came in time."""
+    """Returns `count` payloads from an inbox, or fewer if the others do not come in time."""
     deadline_s = time.monotonic() + TIMEOUT_S
     payloads: list[bytes] = []
     while len(payloads) < count and time.monotonic() < deadline_s:
@@ -52,12 +52,12 @@ def taken(inbox: Inbox, count: int) -> list[bytes]:
 
 
 def awaited(session: Session, *keys: str, timeout_s: float = TIMEOUT_S) -> set[str]:
-    """Return those of `keys` that have no token in time."""
+    """Returns the keys that have no token in time."""
     return session.watch_tokens("run/@alive/**").wait(keys, timeout_s)
 
 
 def child(stack: ExitStack, body: Body, endpoint: str) -> tuple[multiprocessing.process.BaseProcess, Connection]:
-    """Start another process at the other end; it lives no longer than the test."""
+    """Starts another process at the other end of a connection; it ends with the test at the latest."""
     here, there = _spawn.Pipe()
     process = _spawn.Process(target=body, args=(endpoint, there), daemon=True)
     process.start()
@@ -71,7 +71,7 @@ def child(stack: ExitStack, body: Body, endpoint: str) -> tuple[multiprocessing.
 
 
 def hears(connection: Connection) -> object:
-    """Return what a child says."""
+    """Returns the next message of a child process."""
     assert connection.poll(TIMEOUT_S), "the other process says nothing"
     return connection.recv()
 
@@ -225,10 +225,10 @@ def _flood(endpoint: str, parent: Connection) -> None:
         assert awaited(session, "run/@alive/receiver") == set()
         publisher = session.publisher("run/state")
         for number in range(1000):
-            parent.send(number)  # about to put
+            parent.send(number)  # sent before the put
             publisher.put(number.to_bytes(4, "little") + bytes(40_000))
         parent.send(None)
-        parent.recv()  # an ended process would close the pipe on whoever still reads it
+        parent.recv()  # keeps the process alive: its end would close the pipe while the parent still reads
 
 
 def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> None:
@@ -238,15 +238,15 @@ def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> N
     session.declare_token("run/@alive/receiver")
     _, parent = child(stack, _flood, endpoint)
     begun = -1
-    while parent.poll(0.3 if begun > 50 else TIMEOUT_S):  # until the sender stands still
+    while parent.poll(0.3 if begun > 50 else TIMEOUT_S):  # until the sender is blocked
         found = parent.recv()
         assert found is not None, "nothing held the sender back"
         begun = found
-    assert begun < 900  # 40 kB each: what the sockets of both ends hold, and the inbox its 8
+    assert begun < 900  # 40 kB each: the sockets of both ends hold some, the inbox 8
     numbers: list[int] = []
     while len(numbers) < 1000:
         while parent.poll():
-            parent.recv()  # or its words would fill the pipe
+            parent.recv()  # otherwise the messages of the child would fill the pipe
         payloads = inbox.take(TIMEOUT_S)
         assert 0 < len(payloads) <= 8 + 1
         numbers += [int.from_bytes(payload[:4], "little") for payload in payloads]
@@ -254,7 +254,7 @@ def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> N
 
 
 class _Room(threading.Event):
-    """Tells when somebody waits for it."""
+    """An event that shows when a thread waits for it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -301,7 +301,7 @@ def test_a_relay_held_up_on_both_sides_goes_on(stack: ExitStack) -> None:
     begun = -1
     while flood.poll(
         0.5 if begun > 100 else TIMEOUT_S
-    ):  # until all stand still: the relay in a put, and its inbox full
+    ):  # until all are blocked: the relay in a put, and its inbox is full
         found = flood.recv()
         assert found is not None, "nothing held the sender back"
         begun = found
@@ -342,7 +342,7 @@ def test_on_the_wall_clock_a_stopped_peer_blocks_no_put(stack: ExitStack) -> Non
     os.kill(process.pid, signal.SIGSTOP)
     publisher = session.publisher("run/state")
     longest = 0.0
-    for _ in range(500):  # 20 MB: more than the sockets hold
+    for _ in range(500):  # 20 MB, more than the sockets hold
         before = time.monotonic()
         publisher.put(bytes(40_000))
         longest = max(longest, time.monotonic() - before)

@@ -1,4 +1,4 @@
-"""The order of an instant: written out for a small tree, and held against who listens to whom in any tree."""
+"""The order of an instant: written out for a small tree, and checked against the inputs of all stages in random trees."""
 
 import pytest
 from hypothesis import given, settings
@@ -51,7 +51,7 @@ def levels(plan: Plan, role: Role) -> list[int]:
 
 
 def test_the_order_of_an_instant_in_full():
-    """A group in a group: three nodes, one below the other."""
+    """The tree has three nodes, one below the other."""
     tree = (((None,),),)
     mirrored = [
         (Turn.SAY, 0), (Turn.GATHER, 2), (Turn.GATHER, 1), (Turn.GATHER, 0),
@@ -69,7 +69,9 @@ def test_stages_hear_what_was_said_in_turns_before(tree, path):
     plan = made(tree, path)
     roles = make_roles(plan)
     for role in roles:
-        assert levels(plan, role) == sorted(set(levels(plan, role)))  # each once, in the role's own order
+        assert levels(plan, role) == sorted(
+            set(levels(plan, role))
+        )  # each level once, in the order of the role's stages
         for stage, own in zip(role.stages, levels(plan, role), strict=True):
             assert WHOSE[stage.turn] == kind(plan.all_roles[role.index])
             for heard in stage.inputs:
@@ -81,7 +83,7 @@ def test_stages_hear_what_was_said_in_turns_before(tree, path):
 @SETTINGS
 @given(trees(max_robots=8), st.sampled_from(["mirror", "closed"]), st.integers(1, 10**9))
 def test_deadlines_share_the_period_evenly(tree, path, period_ns):
-    """Rounded down, the first at its beginning, the last at its end, as far apart as whole nanoseconds let them be."""
+    """The first deadline is the beginning of the period, the last one its end; the others are evenly spaced, rounded down."""
     plan = made(tree, path)
     found = [deadline_ns(plan, turn, depth, period_ns) for turn, depth in turns(plan)]
     assert (found[0], found[-1]) == (0, period_ns)
@@ -92,7 +94,7 @@ def test_deadlines_share_the_period_evenly(tree, path, period_ns):
 
 
 def test_deadlines_of_robots_in_groups():
-    """In a period of 10 ms, as ever."""
+    """The deadlines of a period of 10 ms, as numbers."""
     tree, period_ns = ((None, None), (None, None)), 10_000_000
     for path, first, apart in (("mirror", 0, 2_000_000), ("closed", 3_000_000, 1_000_000)):
         plan = made(tree, path)

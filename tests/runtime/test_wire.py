@@ -53,7 +53,7 @@ messages = st.builds(
 
 
 def same(one: Message, other: Message) -> bool:
-    """True if two messages are equal to the bit, also where values are NaN."""
+    """True if two messages are equal bit by bit, NaN included."""
     return one[:4] == other[:4] and one.values.tobytes() == other.values.tobytes()
 
 
@@ -114,7 +114,7 @@ def test_a_flipped_byte_of_the_header_never_passes_unseen(message, data):
     except WireError:
         return
     assert not same(decoded, message)
-    assert 2 <= at < 24  # the version, the length and what must be zero are checked
+    assert 2 <= at < 24  # changes of the version, the length and the last zeros are refused
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,8 @@ def test_a_flipped_byte_of_the_header_never_passes_unseen(message, data):
         (VALID[:-1], "length does not match"),
         (VALID + b"\0", "length does not match"),
         (b"\x02\x00" + VALID[2:], "schema version 2, here 1"),
-        (b"\x02\x00", "schema version 2, here 1"),  # a later version may have a shorter header
-        (b"\x02\x00\x77" + bytes(60), "schema version 2, here 1"),  # and other channels
+        (b"\x02\x00", "schema version 2, here 1"),  # another version may have a shorter header
+        (b"\x02\x00\x77" + bytes(60), "schema version 2, here 1"),  # and may have other channels
         (VALID[:2] + b"\x08" + VALID[3:], "unknown channel 8"),
         (VALID[:2] + b"\x00" + VALID[3:], "unknown channel 0"),
         (VALID[:3] + b"\x01" + VALID[4:], "reserved bytes are not zero"),

@@ -147,7 +147,7 @@ def test_torques_are_wanted_then_commanded_then_reported(closed, tables):
     keys = [(float(row["t"]), row["robot"], row["wheel"]) for row in found]
     names = [robot.name for robot in closed.plan.robots]
     assert keys == [(at / 100, name, wheel) for at in range(51) for name in names for wheel in ("right", "left")]
-    protocols = {robot.name: robot.drive.protocol for robot in closed.plan.robots}
+    protocols = {robot.name: robot.drive.protocol.use for robot in closed.plan.robots}
     steps = {"native": 0.001, "odrive": 1e-7, "cia402": closed.plan.robots[-1].drive.motor.rated_torque / 1000}
     assert set(protocols.values()) == set(steps)
     for robot, states in closed.robots.items():

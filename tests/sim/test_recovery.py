@@ -29,7 +29,7 @@ def killed(folder: Path, *arguments: str) -> Path:
     try:
         assert until(lambda: recording.exists() and recording.stat().st_size > ENOUGH, 90), command.stderr
         refused = echelon("recover", folder)
-        assert (refused.returncode, refused.stderr) == (2, f"echelon: {recording}: is being written: the run goes on\n")
+        assert (refused.returncode, refused.stderr) == (2, f"echelon: {folder}: a run is going on there\n")
     finally:
         for pid in session_members(command.pid):
             try:
@@ -66,11 +66,11 @@ def test_what_was_killed_is_rebuilt_in_place(left: Path, tmp_path: Path) -> None
 
     run = open_run(folder)
     summary = run.summary
-    assert not summary.verdict.holds
+    assert summary.verdict.fails
     assert summary.run.failure is not None
     assert summary.run.failure.startswith("broken off: the recording ends at ")
     assert summary.run.failure.endswith("of 3000 s; this summary is rebuilt from it; counts of links were not recorded")
-    assert summary.verdict.reasons[0] == summary.run.failure
+    assert f"whole: {summary.run.failure}" in summary.verdict.reasons
     assert (summary.links, summary.run.wall_time, summary.run.clock) == ((), None, "virtual")
     assert summary.run.engine == left.parent.name.rstrip("0123456789")
     assert summary.simulated == pytest.approx(facts["until"], abs=0.02)
@@ -129,8 +129,8 @@ def test_of_a_run_that_was_recorded_to_its_end_only_what_is_torn_is_mended(torn:
     else:
         assert done.stdout.endswith("written anew: summary.json, report.html\n")
         assert (after["trace_digest"], after["links"]) == (before["trace_digest"], before["links"])
-        (reason,) = after["verdict"]["reasons"]
-        assert reason.startswith("broken off before its summary was written")
+        (reason,) = open_run(tmp_path).summary.verdict.reasons
+        assert reason.startswith("whole: broken off before its summary was written")
 
 
 def test_where_nothing_was_recorded_it_says_so(tmp_path: Path) -> None:
@@ -153,5 +153,5 @@ def test_a_run_killed_before_its_first_state_fails_and_says_why(tmp_path: Path) 
         pass
     assert echelon("recover", tmp_path).returncode == 0
     summary = open_run(tmp_path).summary
-    assert summary.verdict.reasons[0] == "broken off: no state of a robot was recorded"
+    assert "whole: broken off: no state of a robot was recorded" in summary.verdict.reasons
     assert summary.can is None

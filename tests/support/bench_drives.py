@@ -1,4 +1,4 @@
-"""A bench for drives: plans to try them with, and a thread that lets virtual drives work on a bus in real time."""
+"""A bench for drives: plans of drives, and a thread that runs virtual drives on a bus in real time."""
 
 import threading
 import time
@@ -35,25 +35,25 @@ MOTOR = MotorPlan(
     inertia=0.01,
     friction=0.02,
 )
-"""A small wheel motor that follows at once."""
+"""A small wheel motor whose torque follows at once"""
 
 ENVELOPE = EnvelopePlan(torque_limit=1.5, rise_limit=inf, fall_limit=inf, window_limit=inf, stale_ns=100 * MS)
 
 
 def motor_plan(**changes: Any) -> MotorPlan:
-    """Returns the plan of the small motor with changes."""
+    """Returns the plan of the small motor, with changes."""
     return replace(MOTOR, **changes)
 
 
 def protocol(use: str) -> Part[Any]:
-    """Returns a protocol that is built in, or one in a file of the examples."""
+    """Returns a built-in protocol, or one in a file of the examples."""
     return REGISTRY.make("protocols", use, {}, EXAMPLES)
 
 
 def drive_plan(use: str, node_ids: tuple[int, int] | None = None, **changes: Any) -> DrivePlan:
-    """Returns the plan of a robot's drives with changes: 100 Hz, watchdog 100 ms, no recovery.
+    """Returns the plan of a robot's drives, with changes: 100 Hz, watchdog 100 ms, no recovery.
 
-    Unless given, their nodes are 1 and 2, or the robot's number, 3, where that is the node."""
+    Unless given, their node ids are 1 and 2; in a protocol in which the node id is the robot's number, it is 3."""
     part = protocol(use)
     plan = DrivePlan(
         protocol=part,
@@ -69,10 +69,10 @@ def drive_plan(use: str, node_ids: tuple[int, int] | None = None, **changes: Any
 
 
 class Bench:
-    """Virtual drives at work on a bus, in a thread of their own; times are those of the monotonic clock.
+    """Virtual drives that run on a bus in a thread of their own; times are those of the monotonic clock.
 
-    While it runs, what the drives know is read, and faults are injected, under `lock`.  `failure` is what ended the
-    thread before its time, if anything did; leaving the context raises it.
+    While it runs, the drives may be read and changed only under `lock`.  If an exception ends the thread early, it is in
+    `failure`, and leaving the context raises it.
     """
 
     def __init__(self, url: str, drives: Sequence[Drive]) -> None:
@@ -96,14 +96,14 @@ class Bench:
             raise self.failure
 
     def inject(self, drive: int, wheel: int, fault: Any) -> None:
-        """Makes a fault happen now."""
+        """Injects a fault at this moment."""
         with self.lock:
             now_ns = time.monotonic_ns()
             self._advance(now_ns)
             self._send(self.drives[drive].inject(now_ns, wheel, fault))
 
     def mend(self, drive: int, wheel: int, fault: Any) -> None:
-        """Takes a fault's cause away now."""
+        """Removes the cause of a fault at this moment."""
         with self.lock:
             now_ns = time.monotonic_ns()
             self._advance(now_ns)
@@ -114,7 +114,7 @@ class Bench:
             self._turn(None)
             while not self._end.is_set():
                 due_ns = min(drive.due_ns for drive in self.drives)
-                wait_s = min(max(due_ns - time.monotonic_ns(), 0) * 1e-9, 0.1)  # the end is noticed within 0.1 s
+                wait_s = min(max(due_ns - time.monotonic_ns(), 0) * 1e-9, 0.1)  # so that `__exit__` takes at most 0.1 s
                 heard = self._bus.recv(wait_s)
                 self._turn(heard and Frame(heard.can_id, heard.data, heard.remote))
         except BaseException as error:

@@ -1,4 +1,4 @@
-"""A robot's two CiA 402 drives, their host and a master on a bus without delay."""
+"""The two CiA 402 drives of a robot, their host and a network master, on a bus without delay."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -14,12 +14,12 @@ PERIOD_NS = 10 * MS
 
 
 def plan_of(**changes: Any) -> DrivePlan:
-    """Returns the plan of drives 5 and 6."""
+    """Returns the plan of the drives with node ids 5 and 6, with changes."""
     return drive_plan("cia402", NODES, **changes)
 
 
 class Rig:
-    """`listen` gets every frame; `lose` says which do not arrive."""
+    """Drives, host and master.  `listen` is called with every frame; a frame for which `lose` is true does not arrive."""
 
     def __init__(self, plan: DrivePlan) -> None:
         self.plan = plan
@@ -45,7 +45,7 @@ class Rig:
                 self.host.receive(self.time_ns, frame)
 
     def cycle(self, right: float = 0.0, left: float = 0.0) -> None:
-        """SYNC ends the period before; then the host has its turn."""
+        """Runs one period: SYNC ends the previous period, then the host sends the torques."""
         for drive in self.drives:
             self.to_host(drive.advance(self.time_ns))
         self.to_drives([self.master.sync()])

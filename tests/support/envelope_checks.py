@@ -1,4 +1,4 @@
-"""What must hold of the envelope, as functions of its module: mutants of it are given to them as well."""
+"""Checks of the envelope, as functions that take its module, so that they can also be given mutants of the module."""
 
 import math
 from collections import Counter
@@ -25,14 +25,15 @@ def up(value: float) -> float:
 
 
 def sent(gate: Any, now_ns: int, right: float, left: float = 0.0) -> str:
-    """What a fresh command meets: "" if it passed, or the reason; what leaves must fit that."""
+    """Checks a fresh command; returns "" if it passed, otherwise the reason.  Asserts that the output agrees with this."""
     tau_right, tau_left, reason = gate.check(now_ns, now_ns, right, left)
     assert (tau_right, tau_left) == ((right, left) if reason is None else (0.0, 0.0))
     return reason or ""
 
 
 def last(module: ModuleType, plan: EnvelopePlan, torques: list[float], step_ns: int = MS) -> str:
-    """The verdict on the last of some torques of one wheel, after all before it passed; both wheels must agree."""
+    """Returns the result for the last of some torques of one wheel.  Asserts that all before it pass, and that the result is
+    the same for both wheels."""
     reasons = set()
     for wheel in (0, 1):
         gate = module.Envelope(plan)
@@ -76,7 +77,7 @@ def check_rise_limit(module: ModuleType) -> None:
                 top = abs(begin) + limit
                 assert last(module, plan, [*ramp, sign * top]) == ""
                 assert last(module, plan, [*ramp, sign * up(top)]) == Violation.RISE
-                if limit:  # through zero: only what rises from there counts
+                if limit:  # through zero: only the rise from zero counts
                     assert last(module, plan, [*ramp, -sign * limit]) == ""
                     assert last(module, plan, [*ramp, -sign * up(limit)]) == Violation.RISE
 
@@ -87,7 +88,7 @@ def check_fall_limit(module: ModuleType) -> None:
             for sign in (1, -1):
                 plan = replace(FREE, fall_limit=limit)
                 bottom = start - limit
-                if bottom <= 0:  # to zero and beyond is allowed, and rising from there
+                if bottom <= 0:  # falling to zero, and rising on the other side, is allowed
                     assert last(module, plan, [sign * start, -sign * 9.0]) == ""
                     continue
                 assert last(module, plan, [sign * start, sign * bottom]) == ""
@@ -112,10 +113,10 @@ def check_window_limit(module: ModuleType) -> None:
     plan = replace(FREE, window_limit=1.5)
     for sign in (1, -1):
         assert last(module, plan, [sign * 1.5]) == ""
-        assert last(module, plan, [sign * up(1.5)]) == Violation.WINDOW  # from the zero it begins with
+        assert last(module, plan, [sign * up(1.5)]) == Violation.WINDOW  # the window holds the zero at the start
         assert last(module, plan, [sign * 0.5, sign * 0.25, -sign * 1.0]) == ""
         assert last(module, plan, [sign * 0.5, sign * 0.25, -sign * up(1.0)]) == Violation.WINDOW
-        # 250 ms are in the window, one nanosecond more is not
+        # a torque 250 ms ago is in the window; one nanosecond earlier it is not
         gate = module.Envelope(plan)
         assert sent(gate, 0, sign * 1.0) == ""
         assert sent(gate, WINDOW, sign * 2.0) == Violation.WINDOW
@@ -143,9 +144,9 @@ def check_clock(module: ModuleType) -> None:
     assert gate.check(9, 9, 1.0, 1.0).reason == Violation.CLOCK
     assert [sent(gate, now, 1.0) for now in (9, 10)] == [Violation.CLOCK, ""]
     gate.stop(20)
-    gate.stop(15)  # does not turn it back
+    gate.stop(15)  # does not turn the gate's clock back
     assert [sent(gate, now, 1.0) for now in (19, 20)] == [Violation.CLOCK, ""]
-    assert gate.check(30, 31, 0.0, 0.0).reason == Violation.FUTURE  # that is a time, too
+    assert gate.check(30, 31, 0.0, 0.0).reason == Violation.FUTURE  # a refused command also sets the gate's clock
     assert [sent(gate, now, 1.0) for now in (29, 30)] == [Violation.CLOCK, ""]
     assert gate.violations == {Violation.CLOCK: 4, Violation.FUTURE: 1}
 
@@ -165,7 +166,7 @@ def check_after_zero_all_begins_anew(module: ModuleType) -> None:
     gate = risen()
     gate.stop(4)
     assert gate.violations == Counter()
-    assert sent(gate, 5, -0.5, 0.5) == ""  # the way down to zero is not a swing
+    assert sent(gate, 5, -0.5, 0.5) == ""  # the fall to zero does not count in the window
     assert [sent(gate, 5 + n, -0.5 * n, 0.0) for n in (2, 3, 4)] == [Violation.FALL, Violation.RISE, Violation.RISE]
     assert gate.violations == {Violation.FALL: 1, Violation.RISE: 2}
     gate = module.Envelope(replace(FREE, window_limit=2.0))
@@ -177,7 +178,7 @@ def check_after_zero_all_begins_anew(module: ModuleType) -> None:
     gate.stop(3 + 2 * WINDOW)
     assert sent(gate, 4 + 3 * WINDOW, 3.0) == ""
     gate.stop(5 + 3 * WINDOW)
-    assert sent(gate, 4 + 3 * WINDOW, 1.0) == Violation.CLOCK  # zero, at the latest time known
+    assert sent(gate, 4 + 3 * WINDOW, 1.0) == Violation.CLOCK  # zero, at the latest time that the gate knows
     assert sent(gate, 5 + 4 * WINDOW, 3.0) == Violation.WINDOW
 
 
@@ -199,7 +200,7 @@ def check_limits_that_are_none(module: ModuleType) -> None:
 
 
 class SlowGate:
-    """The rules as they are written: all that was sent since the gate's last zero, in exact fractions."""
+    """The rules of the envelope, written directly: it keeps all torques since the gate's last zero, as exact fractions."""
 
     def __init__(self, plan: EnvelopePlan) -> None:
         self.plan = plan
@@ -207,7 +208,7 @@ class SlowGate:
         self.history: list[tuple[int, Fraction, Fraction]] = []
 
     def violated(self, now: int, command: int, torques: tuple[float, float]) -> set[Violation]:
-        """Every rule that these torques break."""
+        """Returns all rules that these torques break."""
         plan = self.plan
         if self.latest is None:
             self.stop(now)
@@ -243,13 +244,13 @@ class SlowGate:
         return broken
 
     def stop(self, now: int) -> None:
-        """Zero is sent."""
+        """Notes that zero is sent."""
         self.latest = now if self.latest is None else max(self.latest, now)
         self.history = [(self.latest, Fraction(0), Fraction(0))]
 
 
 def step(gate: Any, slow: SlowGate, now: int, age: int, torques: tuple[float, float]) -> bool:
-    """One command for both gates; True if it passed."""
+    """Gives one command to both gates; returns True if it passed.  Asserts that they agree."""
     before = Counter(gate.violations)
     broken = slow.violated(now, now - age, torques)
     right, left, reason = gate.check(now, now - age, *torques)

@@ -1,4 +1,4 @@
-"""Invented messages of the paper's formation, for tests of what only carries them."""
+"""Invented messages of the paper's formation, for tests of code that only transports messages."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -20,7 +20,7 @@ def paper() -> Plan:
 
 
 def invented(plan: Plan, ticks: int, seed: int = 1) -> Iterator[Message]:
-    """Yields a run's messages in order of time and source; at time 0 the nodes have nothing to say yet."""
+    """Yields a run's messages in the order of time and source; at time 0 those of the nodes are null messages."""
     random = np.random.default_rng(seed)
     rates, robots = 2 * len(plan.robots), len(plan.robots)
     for tick in range(ticks):

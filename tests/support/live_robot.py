@@ -1,4 +1,4 @@
-"""One robot on a real bus in real time: its virtual drives, and its host in a thread."""
+"""One robot on a real bus in real time: its virtual drives, and its host, each in a thread."""
 
 import threading
 import time
@@ -20,7 +20,8 @@ TORQUES = (0.25, -0.5)
 
 
 def one_robot(folder: Path, protocol: str = "native", **can: Any) -> tuple[Path, Plan]:
-    """Writes the scenario of one robot with a closed torque path, 100 Hz; a machine that stands still is no fault."""
+    """Writes the scenario of one robot with a closed torque path at 100 Hz; returns its file and its plan.  The watchdog is
+    long, so that a busy machine causes no fault."""
     table = scenario(
         (None,),
         np.random.default_rng(1),
@@ -36,7 +37,7 @@ def one_robot(folder: Path, protocol: str = "native", **can: Any) -> tuple[Path,
 
 
 class LiveRobot:
-    """Drives and host at work, until the context ends."""
+    """Drives and host that run until the context ends."""
 
     def __init__(self, plan: Plan, url: str) -> None:
         self._bench = Bench(url, [make_drive(plan, place) for place in drive_places(plan)])

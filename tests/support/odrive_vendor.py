@@ -1,4 +1,4 @@
-"""CANSimple as the vendor's DBC (in the package odrive-can) and cantools have it: frames to send, frames heard."""
+"""CANSimple frames encoded and decoded with cantools and the vendor's DBC (from the package odrive-can)."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from odrive_can import get_dbc
 from echelon.bridge.protocols.frame import Frame
 
 VENDOR: Database = get_dbc()
-"""Axes 0 .. 7"""
+"""Axes 0 to 7"""
 BROADCAST = 63
 
 
@@ -18,7 +18,7 @@ def vendor(command: int, axis: int = 0) -> Message:
 
 
 def frame(axis: int, name: str, **values: Any) -> Frame:
-    """Returns the frame the DBC makes of a message; what is not given is 0.  Axis 63 is all of them."""
+    """Returns the frame of a message by the DBC; values that are not given are 0.  Axis 63 stands for all axes."""
     message = VENDOR.get_message_by_name(f"Axis{0 if axis == BROADCAST else axis}_{name}")
     filled = {signal.name: 0 for signal in message.signals} | values
     return Frame(axis << 5 | message.frame_id & 31, message.encode(filled) if filled else b"")

@@ -24,7 +24,7 @@ def plan_of(name: str, *overrides: str) -> Plan:
 
 
 def trace_of(plan: Plan) -> Trace:
-    """Returns the trace of a plan run in this process."""
+    """Runs a plan in this process and returns the trace."""
     builder = TraceBuilder(plan)
     Engine(plan, builder.add).run()
     return builder.build()
@@ -33,7 +33,7 @@ def trace_of(plan: Plan) -> Trace:
 def echelon(
     *arguments: str | Path, timeout: float = 120, cwd: Path = ROOT, typed: str = "", **options: Any
 ) -> subprocess.CompletedProcess[str]:
-    """Runs the command line to its end; `typed` is what it finds on standard input."""
+    """Runs the command line to its end; `typed` is its standard input."""
     command = [sys.executable, "-m", "echelon", *map(str, arguments)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=timeout, cwd=cwd, input=typed, check=False, **options
@@ -41,7 +41,7 @@ def echelon(
 
 
 def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
-    """Starts the command line in a session of its own, so that all its processes can be found."""
+    """Starts the command line in a process session of its own, so that all its processes can be found."""
     return subprocess.Popen(
         [sys.executable, "-m", "echelon", *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -52,12 +52,12 @@ def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
         start_new_session=True,
         preexec_fn=lambda: signal.signal(
             signal.SIGINT, signal.SIG_DFL
-        ),  # where tests run in the background it is ignored
+        ),  # otherwise SIGINT is ignored if the tests run in the background
     )
 
 
 def _alive() -> list[tuple[int, int, int]]:
-    """Returns process, parent and session of all that are alive, zombies not counted."""
+    """Returns (process, parent, session) of all processes that are alive, without zombies."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -71,7 +71,7 @@ def _alive() -> list[tuple[int, int, int]]:
 
 
 def lab_dbc(torque_scale: float = 0.001) -> str:
-    """Returns the DBC of lab.toml's robots, g1/r1 to g3/r9, with native drives."""
+    """Returns the DBC of the robots of lab.toml, g1/r1 to g3/r9, with native drives."""
     from echelon.bridge.protocols.plan_dbc import plan_dbc
 
     return plan_dbc(plan_of("lab", f"can.torque_scale={torque_scale!r}"))
@@ -83,7 +83,7 @@ def session_members(session: int) -> list[int]:
 
 
 def descendants(ancestor: int) -> list[int]:
-    """Returns the processes that come from one, over any number of generations."""
+    """Returns the descendants of a process, over any number of generations."""
     alive, found = _alive(), [ancestor]
     for one in found:
         found += [pid for pid, parent, _ in alive if parent == one]
@@ -91,13 +91,14 @@ def descendants(ancestor: int) -> list[int]:
 
 
 def pid_of(name: str, processes: list[int]) -> int:
-    """Returns the one of some processes that bears a name."""
+    """Returns the process with a name, one of `processes`."""
     (pid,) = [pid for pid in processes if Path(f"/proc/{pid}/comm").read_text().strip() == name]
     return pid
 
 
 def until(condition: Any, timeout_s: float = 20.0) -> bool:
-    """Waits until a condition of other processes holds; False if it never does.  There is no event to wait for."""
+    """Waits until a condition about other processes holds; returns False if it does not hold in time.  It polls, because there
+    is no event to wait for."""
     import time
 
     deadline_s = time.monotonic() + timeout_s
@@ -115,7 +116,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
 
 
 def kill_session(session: int) -> None:
-    """Ends whatever a failed test left behind."""
+    """Ends all processes of a session that a failed test may have left behind."""
     for pid in session_members(session):
         try:
             os.kill(pid, signal.SIGKILL)

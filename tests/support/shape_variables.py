@@ -1,4 +1,4 @@
-"""Shape variables, written out for equal weights."""
+"""Shape variables for equal weights, written out."""
 
 from math import sqrt
 
@@ -6,7 +6,7 @@ SQRT2 = sqrt(2)
 
 
 def variables(points):
-    """The shape variables of equal weights, written out from theory.md section 2."""
+    """Returns the shape variables of children with equal weights, written out from docs/architecture.md, 2.3."""
     found = [tuple((a - b) / SQRT2 for a, b in zip(points[0], points[1], strict=True))]
     for k in range(2, len(points)):
         mean = [sum(point[axis] for point in points[:k]) / k for axis in (0, 1)]

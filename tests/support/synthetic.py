@@ -1,4 +1,4 @@
-"""A run whose every number is known: the paper's plan with errors that decay exponentially, each layer at its rate."""
+"""A run with known numbers: the paper's plan with errors that decay exponentially, each layer with its own time constant."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from echelon.sim.results.trace import Trace
 
 PAPER = shipped.FOLDER / "paper.toml"
 DECAY = {"intra": 0.02, "inter": 0.2, "centroid": 2.0}
-"""Time constants [s] of a layer's error"""
+"""Time constants of the errors by layer [s]"""
 PINNED = (
     "duration=12.0",
     "periods={acceleration=0.001, torque=0.0001}",
@@ -29,7 +29,7 @@ PINNED = (
     "can.bitrate=1_000_000",
     'claims=[{block="intra", settled_by=0.1}, {block="inter", settled_by=1.0}, {block="centroid", settled_by=10.0}]',
 )
-"""What the tests count on, whatever the shipped scenario says"""
+"""Values that the tests rely on; they replace those of the shipped scenario"""
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 PERIOD_NS = 1_000_000
 
@@ -44,7 +44,7 @@ class Run:
 
     @property
     def plan(self) -> Plan:
-        """The run's plan."""
+        """The plan of the run."""
         return self.trace.plan
 
 
@@ -53,7 +53,7 @@ Motion = Callable[[BlockPlan, NDArray[np.float64]], tuple[NDArray[np.float64], N
 
 
 def decaying(overrides: Sequence[str] = (), times_ns: NDArray[np.int64] | None = None) -> Run:
-    """Returns a run with e_b(t) = e_b(0) exp(-t/decay): positions, velocities, headings; all torques zero."""
+    """Returns a run with e_b(t) = e_b(0) exp(-t/decay) in positions, velocities and headings; all torques are zero."""
     start = {}
 
     def motion(block: BlockPlan, seconds: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -90,7 +90,8 @@ def of_errors(plan: Plan, motion: Motion, times_ns: NDArray[np.int64] | None = N
 
 
 def at_places(places: NDArray[np.float64], overrides: Sequence[str] = (), period_ns: int = PERIOD_NS) -> Trace:
-    """Returns a trace of the first robots standing at places (T, K, 2), all others far from them and each other."""
+    """Returns a trace in which the first K robots are at `places`, (T, K, 2), and all others are far from them and from each
+    other."""
     _, plan = load(PAPER, [*PINNED, *overrides])
     states = np.zeros((len(places), len(plan.robots), len(STATE_FIELDS)))
     states[:, :, FIELD["x"]] = 1e4 * (1 + np.arange(len(plan.robots)))
@@ -99,7 +100,7 @@ def at_places(places: NDArray[np.float64], overrides: Sequence[str] = (), period
 
 
 def of_states(plan: Plan, times_ns: NDArray[np.int64], states: NDArray[np.float64]) -> Trace:
-    """Returns the trace of states (T, robots, fields) at the same instants for all."""
+    """Returns the trace of states, (T, robots, fields), at instants that all robots share."""
     robots = range(states.shape[1])
     return Trace(plan, tuple(times_ns for _ in robots), tuple(np.ascontiguousarray(states[:, r]) for r in robots))
 
@@ -110,7 +111,7 @@ def with_states(trace: Trace, states: Sequence[NDArray[np.float64]]) -> Trace:
 
 
 def link_counts(plan: Plan) -> list[LinkCounts]:
-    """Returns counts for all links of a plan, the first lossy and late, the others ideal."""
+    """Returns counts for all links of a plan: the first has loss and delay, the others are ideal."""
     ideal = [LinkCounts(link.source, link.receiver, link.channel, 10, 10, 0, 0, 10, 0, 0.0, 0) for link in plan.links]
     first = plan.links[0]
     ideal[0] = LinkCounts(first.source, first.receiver, first.channel, 10, 7, 2, 1, 9, 3, 2_500_000.25, 6_000_000)
@@ -118,13 +119,13 @@ def link_counts(plan: Plan) -> list[LinkCounts]:
 
 
 def run_facts(**given: Any) -> RunFacts:
-    """Returns how a run was run, with what is given instead."""
+    """Returns the facts of a run; `given` replaces some of them."""
     facts = RunFacts("inprocess", "virtual", 6.0, 0.0, 2.0, 200.0, 0, None)
     return replace(facts, **given)
 
 
 def can_report(**given: Any) -> CanReport:
-    """Returns the report of a bus on which nothing happened, with what is given instead."""
+    """Returns the report of a bus on which nothing happened; `given` replaces some of its values."""
     bus = BusReport("can0", 500_000, 0.25)
     report = CanReport(
         path="mirror", timing=None, url="virtual", listen="", torque_scale=0.001, log_start=0.0, frames=12, load_mean=0.25,

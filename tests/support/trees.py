@@ -1,4 +1,4 @@
-"""Invented plans: trees of any depth with matrix gains and couplings, all numbers from one seed."""
+"""Random plans: trees of any depth with matrices as gains and couplings; all numbers come from one seed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,13 +17,13 @@ from echelon.scenario.tables import Scenario
 from echelon.sim.parts.loading import REGISTRY
 
 Tree = Sequence[Any]
-"""Children of a node: None is a robot, a sequence a group"""
+"""The children of a node: None is a robot, a sequence is a group"""
 ROBOT = {"mass": 10.0, "inertia": 0.5, "wheel_radius": 0.1, "arm": 0.4, "offset": 0.2}
 PAPER_TREE: Tree = ((None,) * 3,) * 3
 
 
 def trees(max_depth: int = 4, max_children: int = 4, max_robots: int = 14) -> st.SearchStrategy[Tree]:
-    """Trees of 1 to `max_depth` layers of nodes, 1 to `max_children` children each, robots and groups mixed."""
+    """Returns trees of 1 to `max_depth` layers of nodes.  Each node has 1 to `max_children` children, robots or groups."""
 
     def node(depth: int) -> st.SearchStrategy[Tree]:
         child: st.SearchStrategy[Any] = st.none()
@@ -35,22 +35,22 @@ def trees(max_depth: int = 4, max_children: int = 4, max_robots: int = 14) -> st
 
 
 def count_robots(tree: Tree) -> int:
-    """Returns how many robots a tree has."""
+    """Returns the number of robots of a tree."""
     return sum(1 if child is None else count_robots(child) for child in tree)
 
 
 def count_nodes(tree: Tree) -> int:
-    """Returns how many nodes a tree has."""
+    """Returns the number of nodes of a tree."""
     return 1 + sum(count_nodes(child) for child in tree if child is not None)
 
 
 def count_layers(tree: Tree) -> int:
-    """Returns how many layers of nodes a tree has."""
+    """Returns the number of layers of nodes of a tree."""
     return 1 + max((count_layers(child) for child in tree if child is not None), default=0)
 
 
 def group_table(tree: Tree, random: Generator, spread: float = 10.0) -> dict[str, Any]:
-    """Returns the scenario's table of a group: robots first, then groups, anywhere within `spread` [m]."""
+    """Returns the scenario's table of a group: robots first, then groups, at random places within `spread` [m]."""
     table: dict[str, Any] = {"robots": {}, "groups": {}}
     if len(tree) > 1:
         table["shape"] = {"kind": "points", "points": random.normal(size=(len(tree), 2), scale=3.0).tolist()}
@@ -82,7 +82,7 @@ def plan_of(table: dict[str, Any]) -> Plan:
 
 
 def random_law(tree: Tree, random: Generator, time_scales: str = "three", coupling: float = 0.5) -> dict[str, Any]:
-    """Returns a law for a tree of two layers as a file has it: every block with full gains, every pair with K̄."""
+    """Returns the table `[law]` for a tree of two layers: full gain matrices for every block, K̄ for every pair of blocks."""
     law = random_epsilon(tree, random, time_scales)
     bare = plan_of(scenario(tree, random, law=law))
     law["gains"] = [
@@ -103,7 +103,7 @@ def random_law(tree: Tree, random: Generator, time_scales: str = "three", coupli
 
 
 def with_random_gains(plan: Plan, random: Generator, coupling: float = 0.5) -> Plan:
-    """Returns a plan with full gain matrices of its own for every block, and K̄ full but for its diagonal blocks."""
+    """Returns a plan in which every block has its own full gain matrices, and K̄ is full outside its diagonal blocks."""
     size = 2 * len(plan.robots)
     k_bar = coupling * random.normal(size=(size, size))
     blocks = []
@@ -116,12 +116,12 @@ def with_random_gains(plan: Plan, random: Generator, coupling: float = 0.5) -> P
 
 
 def random_epsilon(tree: Tree, random: Generator, time_scales: str = "three") -> dict[str, Any]:
-    """Returns a law of time scales that are not far apart."""
+    """Returns the table `[law]` with random time scales that are not far apart."""
     count = count_layers(tree) if time_scales == "three" else count_nodes(tree)
     return {"time_scales": time_scales, "epsilon": random.uniform(0.6, 1.0, count).tolist()}
 
 
 def near_unit(size: int, random: Generator) -> list[list[float]]:
-    """Returns a full matrix not far from the unit matrix."""
+    """Returns a random full matrix close to the unit matrix."""
     rows: list[list[float]] = (np.eye(size) + 0.2 * random.normal(size=(size, size))).tolist()
     return rows

@@ -1,4 +1,4 @@
-"""Random formations, and all that is said in them."""
+"""Random formations, and a record of all messages in them."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ NEAR = AvoidancePlan(True, avoidance_radius=0.3, sensing_radius=4.0, force_limit
 
 LAWS = {
     "linear": {},
-    "integral": {"k_i": 0.3, "limit": 0.01},  # so small that the integral is cut off
+    "integral": {"k_i": 0.3, "limit": 0.01},  # so small that the integral is clipped
     "terminal_sliding": {"gamma": 1.7, "beta": 2.0, "kappa": 1.5},
 }
 
@@ -33,7 +33,7 @@ def random_plan(
 
 
 class Watched:
-    """An engine whose robots start anywhere, and all that was said in it, by (channel, source, instant)."""
+    """An engine whose robots start at random, and all its messages by (channel, source, instant)."""
 
     def __init__(self, plan: Plan, seed: int) -> None:
         self.plan = plan
@@ -54,7 +54,7 @@ class Watched:
         return np.array([self.said[Channel.STATE, robot.index, time_ns].values for robot in self.plan.robots])
 
     def commanded(self, time_ns: int) -> Array:
-        """Returns the accelerations that the robots were sent at an instant, (N, 2)."""
+        """Returns the accelerations that were sent to the robots at an instant, (N, 2)."""
         return np.array(
             [
                 self.said[Channel.COMMAND, robot.parent, time_ns].values.reshape(-1, 2)[robot.child_number]

@@ -25,9 +25,9 @@ from support.bench_drives import MS, Bench, drive_plan
 pytestmark = pytest.mark.vcan
 
 URL = "socketcan:vcan0"
-PLAN = drive_plan("odrive", (1, 2), watchdog_ns=1000 * MS)  # the client waits for heartbeats without sending torques
+PLAN = drive_plan("odrive", (1, 2), watchdog_ns=3000 * MS)  # the client waits for heartbeats without sending torques
 DBC = Path(odrive_can.__file__).parent / "dbc" / "odrive-cansimple-0.6.10.dbc"
-LIMIT_S = 20.0
+LIMIT_S = 100.0
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ def late(delay: float) -> str:
 
 def continuous(plan: Plan, instants: Array) -> Array:
     """Returns positions (T, N, 2) under the continuous law and ideal torque: p̈ = a means v̇ = e_v · a + d ω² and
-    ω̇ = (e_n · a - v ω)/d (theory.md section 1), state x, y, θ, v, ω per robot."""
+    ω̇ = (e_n · a - v ω)/d (docs/architecture.md, 2.1), state x, y, θ, v, ω per robot."""
     central = CentralLaw(plan, lead=0.0)
     d = np.array([robot.offset for robot in plan.robots])
     count = len(plan.robots)
@@ -109,7 +109,7 @@ def test_claims_of_the_paper_hold(paper):
 
 
 def test_blocks_settle_one_after_the_other(paper):
-    """Largest errors: intra at 0.1 s, inter at 1 s, centroid at 10 s, measured once by other means (theory.md 7)."""
+    """Largest errors: intra at 0.1 s, inter at 1 s, centroid at 10 s, measured independently (docs/architecture.md, 2.10)."""
     blocks = block_series(paper)
     at = {"intra": (0.1, 0.059), "inter": (1.0, 0.111), "centroid": (10.0, 0.076)}
     for layer, (t, metres) in at.items():

@@ -1,0 +1,34 @@
+"""Where torques step up and down by the resolution of their frames, which draws a band instead of a line."""
+
+from typing import Final
+
+import numpy as np
+
+from echelon.bridge.protocols.registry import protocol_of
+from echelon.sim.report.figures import TAUS
+from echelon.sim.results.can_lines import some
+from echelon.sim.results.trace import Trace
+
+SHARE: Final = 0.1
+"""Of a robot's periods in which a torque steps by one or two, at least, for it to be told"""
+
+
+def steps_text(trace: Trace) -> str:
+    """Returns whose torques step by the resolution of their frames, and by how much; empty if none do.
+
+    They do on a closed torque path alone: there a wheel has what its frames carry."""
+    if not trace.plan.can.closed:
+        return ""
+    found: dict[float, list[str]] = {}
+    for robot, states in zip(trace.plan.robots, trace.states, strict=True):
+        step = protocol_of(robot).resolution(robot.drive)
+        with np.errstate(invalid="ignore"):
+            change = np.abs(np.diff(states[:, TAUS], axis=0))
+            stepped = (change > 0.2 * step) & (change < 2.2 * step)
+        if step > 0 and len(stepped) and stepped.mean(axis=0).max() > SHARE:
+            found.setdefault(step, []).append(robot.name)
+    return " ".join(
+        f"In frames of {some(names)} torque has steps of {step:.3g} N m: where it is small it goes up and down by a step or "
+        "two, and its line becomes a band."
+        for step, names in found.items()
+    )

@@ -1,0 +1,113 @@
+"""What others may rely on, as a page: `make docs` writes docs/public-names.md, a test holds it against the code."""
+
+import ast
+import inspect
+from argparse import ArgumentParser, _SubParsersAction
+from collections.abc import Iterator
+
+import echelon
+from echelon.cli.parser import ENTRIES, MISTAKES, make_parser
+from echelon.messages import Channel
+from echelon.plugins import Plugin
+from echelon.sim.parts.loading import REGISTRY
+from echelon.sim.run import FILES
+from support.runs import ROOT
+
+HEAD = """\
+# Public names
+
+What others may rely on, made from the code by `make docs`. A test fails when one of these names changes unnoticed. The keys of
+a scenario are in [scenario.md](scenario.md), those of `summary.json` in [summary.schema.json](summary.schema.json); both are
+made and tested in the same way. What is in neither of these pages is internal and may change.
+"""
+
+
+def page() -> str:
+    """Returns the page."""
+    sections = {
+        "In Python: `import echelon`": _python(),
+        "Parts": _parts(),
+        "What parts import": _imports(),
+        "Commands": _commands(),
+        "Exit codes": _exit_codes(),
+        "Files of a run": (f"- `{name}`" for name in FILES),
+        "Channels of messages": (f"- `{channel.name}` = {channel.value}" for channel in Channel),
+    }
+    return HEAD + "".join(f"\n## {title}\n\n" + "\n".join(lines) + "\n" for title, lines in sections.items())
+
+
+def _python() -> Iterator[str]:
+    for name in sorted(echelon.__all__):
+        value = getattr(echelon, name)
+        if not callable(value):
+            yield f"- `{name}`"
+            continue
+        has_signature = inspect.isfunction(value) or not issubclass(value, (Plugin, Exception, tuple))
+        yield f"- `{name}{_signature(value) if has_signature else ''}`"
+        if inspect.isclass(value):
+            yield from _members(value)
+
+
+def _members(of: type) -> Iterator[str]:
+    if issubclass(of, tuple):
+        yield from (f"  - `.{field}`" for field in of._fields)  # type: ignore[attr-defined]
+        return
+    for name, member in sorted(vars(of).items()):
+        if name.startswith("_") or name.startswith("model_"):
+            continue
+        abstract = " (must be given)" if getattr(member, "__isabstractmethod__", False) else ""
+        if inspect.isfunction(member):
+            yield f"  - `.{name}{_signature(member)}`{abstract}"
+        elif isinstance(member, property):
+            yield f"  - `.{name}`{abstract}"
+        elif name in getattr(of, "__annotations__", {}):
+            yield f"  - `.{name}`"
+
+
+def _signature(value: object) -> str:
+    """Returns the names of the arguments and their defaults; types are for mypy."""
+    signature = inspect.signature(value)  # type: ignore[arg-type]
+    bare = [p.replace(annotation=p.empty) for name, p in signature.parameters.items() if name != "self"]
+    return str(inspect.Signature(bare))
+
+
+def _parts() -> Iterator[str]:
+    yield "| entry points | base class | built in |"
+    yield "|---|---|---|"
+    bases = {"laws": "Law", "plants": "Plant", "trajectories": "Trajectory", "protocols": "DriveProtocol"}
+    for name, group in REGISTRY.groups.items():
+        assert all(issubclass(part, getattr(echelon, bases[name])) for part in group.built_in.values())
+        yield f"| `echelon.{name}` | `echelon.{bases[name]}` | {', '.join(f'`{part}`' for part in group.built_in)} |"
+
+
+def _imports() -> Iterator[str]:
+    """Yields what the examples of parts import: authors of parts need these modules, too."""
+    found: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("echelon."):
+                found.setdefault(str(node.module), set()).update(name.name for name in node.names)
+    yield from (f"- `{module}`: {', '.join(f'`{name}`' for name in sorted(found[module]))}" for module in sorted(found))
+
+
+def _commands() -> Iterator[str]:
+    parser = make_parser()
+    (commands,) = (action for action in parser._actions if isinstance(action, _SubParsersAction))
+    for name in ENTRIES:
+        yield f"- `echelon {name}`: {' '.join(f'`{option}`' for option in _options(commands.choices[name]))}"
+
+
+def _options(parser: ArgumentParser) -> Iterator[str]:
+    for action in parser._actions:
+        yield ", ".join(action.option_strings) or str(action.metavar or action.dest)
+
+
+def _exit_codes() -> Iterator[str]:
+    for name, entry in ENTRIES.items():
+        codes = entry.command(name).codes
+        yield f"- `echelon {name}`: {'; '.join(f'{code} {meaning}' for code, meaning in codes.items())}"
+    yield f"- all: {'; '.join(f'{code} {meaning}' for code, meaning in MISTAKES.items())}"
+
+
+if __name__ == "__main__":
+    print(page(), end="")

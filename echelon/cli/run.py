@@ -95,7 +95,8 @@ COMMANDS: Final = (
         work=run,
         about="""\
 Runs a scenario and leaves one folder: report.html, run.mcap (for Foxglove, PlotJuggler and the
-like), can.log, torque.dbc, summary.json, and scenario.toml with every default written out.
+like), can.log, torque.dbc, summary.json, run.json (where its buses are, from the start), and
+scenario.toml with every default written out.
 Given the folder of a run, it runs that scenario again, into a new folder.""",
         examples={
             "echelon run paper": "the paper's nine robots, thirteen processes over Zenoh",

@@ -9,9 +9,9 @@ import echelon
 from echelon.cli.parser import ENTRIES, MISTAKES, make_parser
 from echelon.messages import Channel
 from echelon.plugins import Plugin
+from echelon.sim.out_folder import run_files
 from echelon.sim.parts.loading import REGISTRY
-from echelon.sim.run import FILES
-from support.runs import ROOT
+from support.runs import ROOT, plan_of
 
 HEAD = """\
 # Public names
@@ -30,7 +30,7 @@ def page() -> str:
         "What parts import": _imports(),
         "Commands": _commands(),
         "Exit codes": _exit_codes(),
-        "Files of a run": (f"- `{name}`" for name in FILES),
+        "Files of a run": (f"- `{name}`" for name in run_files(plan_of("lab"), bus=True)),
         "Channels of messages": (f"- `{channel.name}` = {channel.value}" for channel in Channel),
     }
     return HEAD + "".join(f"\n## {title}\n\n" + "\n".join(lines) + "\n" for title, lines in sections.items())

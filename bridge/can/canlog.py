@@ -7,7 +7,7 @@ The format is that of `candump -l`, which log2asc, canplayer, `cantools decode` 
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -138,9 +138,14 @@ def read_log(path: Path) -> Iterator[Logged]:
 
     Raises OSError if the log cannot be read."""
     with path.open(encoding="ascii", errors="replace") as lines:
-        for line in lines:
-            if match := _LINE.fullmatch(line.strip()):
-                seconds, micros, channel, identifier, remote, data = match.groups()
-                time_ns = int(seconds) * 1_000_000_000 + int(micros) * 1000
-                frame = Frame(int(identifier, 16) & 0x7FF, bytes.fromhex(data or ""), remote is not None)
-                yield Logged(time_ns, channel, frame)
+        yield from read_lines(lines)
+
+
+def read_lines(lines: Iterable[str]) -> Iterator[Logged]:
+    """Yields the frames of lines of a log, as `read_log` does."""
+    for line in lines:
+        if match := _LINE.fullmatch(line.strip()):
+            seconds, micros, channel, identifier, remote, data = match.groups()
+            time_ns = int(seconds) * 1_000_000_000 + int(micros) * 1000
+            frame = Frame(int(identifier, 16) & 0x7FF, bytes.fromhex(data or ""), remote is not None)
+            yield Logged(time_ns, channel, frame)

@@ -23,11 +23,11 @@ commands, one per acceleration period.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
-from echelon.bridge.can.canlog import read_log
+from echelon.bridge.can.canlog import Logged, read_log
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.observe import Finding, Observer
 from echelon.bridge.protocols.registry import protocol_of, shared_cyclic
@@ -229,9 +229,14 @@ def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole:
 
 
 def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:
-    """Yields run time [ns], number of the bus, and frame from a run's can.log; skips buses that the plan does not have."""
+    """Yields run time [ns], number of the bus and frame from a run's can.log; skips buses that the plan does not have."""
+    return of_run(read_log(path), plan)
+
+
+def of_run(logged: Iterable[Logged], plan: Plan) -> Iterator[tuple[int, int, Frame]]:
+    """Yields run time [ns], number of the bus and frame of logged frames; skips buses that the plan does not have."""
     numbers = {bus.name: number for number, bus in enumerate(plan.can.buses)}
     start_ns = plan.can.bring_up_ns if plan.can.closed else 0
-    for time_ns, channel, frame in read_log(path):
+    for time_ns, channel, frame in logged:
         if (number := numbers.get(channel)) is not None:
             yield time_ns - start_ns, number, frame

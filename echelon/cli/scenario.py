@@ -99,6 +99,7 @@ def validate(options: ValidateOptions) -> int:
     """Checks a scenario and says what it means."""
     from echelon.bridge.timing.fit import describe_fit
     from echelon.cli.scenario_file import read_scenario
+    from echelon.sim.results.beforehand import beforehand
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
     facts: dict[str, Any] = {
@@ -109,6 +110,7 @@ def validate(options: ValidateOptions) -> int:
         "ticks": plan.duration_ns // plan.robots[0].period_ns,
         "time_scales": {block.name: block.sigma for block in plan.blocks},
         "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
+        "notes": list(beforehand(plan)),
     }
     if options.json:
         print(json.dumps(facts, indent=2))
@@ -118,6 +120,8 @@ def validate(options: ValidateOptions) -> int:
     print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
     for line in facts["can"]:
         print(f"  CAN  {line}")
+    for line in facts["notes"]:
+        print(f"  note {line}")
     return 0
 
 

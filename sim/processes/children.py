@@ -156,6 +156,7 @@ def list_specs(
     metadata: dict[str, str],
     part_files: dict[str, str],
     recorded: bool,
+    keep_going: bool,
 ) -> list[ProcessSpec]:
     """Returns the specifications of all processes of a run, with their connections.
 
@@ -182,6 +183,7 @@ def list_specs(
         "scenario_toml": scenario_toml,
         "metadata": metadata,
         "part_files": part_files,
+        "keep_going": keep_going,
     }
 
     def with_hubs(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:

@@ -51,6 +51,8 @@ class ProcessSpec:
     """A URL for each bus of the plan; empty: no bus"""
     scenario_toml: str = ""
     metadata: dict[str, str] = field(default_factory=dict)
+    keep_going: bool = False
+    """The run goes on though a robot's state is not finite"""
     part_files: dict[str, str] = field(default_factory=dict)
     """Texts of the files of users' parts, by their names in the run's folder"""
 

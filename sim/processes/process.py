@@ -93,6 +93,8 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
             runner.lockstep(lambda time_ns, sources: control.send(Waiting(time_ns, tuple(sources))))
         else:
             runner.wall_clock(start_ns)
+    except SystemExit:  # the run breaks off; what was counted so far is still told
+        pass
     finally:
         runner.finish()  # also if the run breaks off: its messages so far must be recorded
     signal.signal(signal.SIGTERM, _leave)

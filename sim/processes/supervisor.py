@@ -85,10 +85,16 @@ class Outcome:
     wall_s: float
     messages: int
     failure: str | None = None
+    stopped: str | None = None
+    """Why the run was stopped before its end though nothing failed"""
 
 
 class RunError(Exception):
     """The run cannot go on; the text says why."""
+
+
+class DivergedError(Exception):
+    """There is no point in going on; the text says why."""
 
 
 class Supervisor:
@@ -111,6 +117,7 @@ class Supervisor:
         recorded: bool = True,
         show: Callable[[Progress], None] = lambda progress: None,
         stall_timeout_s: float = 30.0,
+        keep_going: bool = False,
         order: Callable[[list[ProcessSpec]], list[ProcessSpec]] = lambda specs: specs,
     ) -> None:
         self.plan, self.virtual = plan, virtual
@@ -118,7 +125,7 @@ class Supervisor:
         self._show = show
         self._stall_timeout_s = stall_timeout_s
         told = scenario_toml, metadata or {}, part_files or {}
-        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded))
+        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going))
         self._children: list[Child] = []
         self._moved_s = 0.0
         self._moved_at = (-1, -1)
@@ -128,6 +135,7 @@ class Supervisor:
         """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised."""
         begun_s = time.monotonic()
         failure: str | None = None
+        diverged = False
         startup_s = wall_s = 0.0
         previous = signal.signal(signal.SIGTERM, _interrupt)
         try:
@@ -146,15 +154,18 @@ class Supervisor:
             self.progress.phase = "finishing"
         except RunError as error:
             failure = str(error)
+        except DivergedError as error:
+            diverged, self.progress.note = True, f"{error}: the run stops"
         except KeyboardInterrupt:
             failure = "interrupted"
-        if failure is not None:
+        broken = diverged or failure is not None
+        if broken:
             wall_s = max(0.0, time.monotonic() - self.progress.started_s) if self.progress.started_s else 0.0
-            self.progress.note = failure.splitlines()[0]
+            self.progress.note = failure.splitlines()[0] if failure else self.progress.note
         try:
-            if failure is not None:
+            if broken:
                 self._stop_members()
-            failure = self._finish_watchers(failure)
+            failure = self._finish_watchers(failure, broken)
         except KeyboardInterrupt:
             failure = failure or "interrupted"
         finally:
@@ -226,6 +237,9 @@ class Supervisor:
                 progress.hear(said)
                 if said.failure and progress.phase == "running":
                     raise RunError(f"the recording failed: {said.failure}")
+                if said.lost is not None and progress.phase == "running":
+                    progress.phase = "stopping"
+                    raise DivergedError(said.lost.text(self.plan))
             case Failed():
                 starting = progress.phase == "starting"
                 raise RunError(
@@ -311,14 +325,16 @@ class Supervisor:
         ):
             try:
                 self._serve(0.05)
-            except RunError:
-                pass  # the reason why the run broke off is known already
+            except (RunError, DivergedError):
+                pass  # why the run broke off is known already
         for child in members:
             if child.process.is_alive() and child.done is None:
                 child.process.kill()
 
-    def _finish_watchers(self, failure: str | None) -> str | None:
-        """Lets bridge, drives, referee and recorder finish, in this order; returns the failure, old or new."""
+    def _finish_watchers(self, failure: str | None, broken: bool) -> str | None:
+        """Lets bridge, drives, referee and recorder finish, in this order; returns the failure, old or new.
+
+        A run that has `broken` off owes them messages that never come."""
         links = [counts for child in self._children if child.done for counts in child.done.links]
         sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
         for child in self._children:
@@ -334,7 +350,8 @@ class Supervisor:
                     or not child.process.is_alive()
                 ):
                     continue
-                whole = failure is None and self.virtual  # on a wall clock, messages may be lost
+                # On a wall clock, messages may be lost on the way.
+                whole = not broken and failure is None and self.virtual
                 order = Finish(
                     links=tuple(links),
                     robot_messages=sent["robot"] if whole else None,
@@ -349,7 +366,7 @@ class Supervisor:
                         if not failure and time.monotonic() - begun_s > STALL_REPORT_S:
                             self.progress.note = f"waits for {child.name} to finish ({child.state()})"
                             self._show(self.progress)
-                except (RunError, OSError) as error:
+                except (RunError, DivergedError, OSError) as error:
                     failure = failure or str(error)
                 if child.done is not None and isinstance(child.done.report, CanReport):
                     sent["bridge"] = child.done.report.messages
@@ -407,6 +424,7 @@ class Supervisor:
             wall_s=wall_s,
             messages=0 if recorder is None else recorder.messages,
             failure=failure,
+            stopped=None if recorder is None else recorder.stopped(self.plan),
         )
 
     def _tell_all(self, message: Told) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
+from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
 from echelon.sim.results.trace import Array, Trace
@@ -36,6 +37,18 @@ class Waiting:
 
 
 @dataclass(frozen=True, slots=True)
+class Lost:
+    """The first state that is not finite: of which robot (its index), and when."""
+
+    robot: int
+    time_ns: int
+
+    def text(self, plan: Plan) -> str:
+        """Returns it in words."""
+        return f"the state of {plan.robots[self.robot].name} is not finite from {self.time_ns / 1e9:g} s on"
+
+
+@dataclass(frozen=True, slots=True)
 class RecorderProgress:
     """Progress of the recorder; `states` are the last states of the robots, at `states_ns`."""
 
@@ -44,6 +57,8 @@ class RecorderProgress:
     states_ns: int
     states: Array | None
     failure: str | None
+    lost: Lost | None = None
+    """Why the run is to stop"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +70,14 @@ class RecorderReport:
     refused: int
     """Number of invalid batches, and of messages from unknown sources or out of order"""
     failure: str | None
+    lost: Lost | None = None
+    """Where the recording ends; None if it goes on to the end"""
+
+    def stopped(self, plan: Plan) -> str | None:
+        """Returns why the run was stopped before its end though nothing failed; None if it was not."""
+        if self.lost is None or self.lost.time_ns >= plan.duration_ns:
+            return None
+        return self.lost.text(plan)
 
 
 Report = CanReport | DrivesReport | RefereeReport | RecorderReport

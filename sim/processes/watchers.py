@@ -6,6 +6,7 @@ clock it loses messages and counts them.
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import isfinite
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +20,7 @@ from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Inbox, Session
 from echelon.runtime.wire import WireError, count_refusal, decode, split, watch_key
 from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
-from echelon.sim.processes.to_supervisor import RecorderProgress, RecorderReport
+from echelon.sim.processes.to_supervisor import Lost, RecorderProgress, RecorderReport
 from echelon.sim.recording.recorder import Recorder
 from echelon.sim.recording.time_order import TimeOrder, speakers
 from echelon.sim.results.trace import TraceBuilder
@@ -90,7 +91,9 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     sources = speakers(plan, spec.virtual, bool(spec.can_urls))
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
     try:
-        recording = RunRecorder(Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files)
+        recording = RunRecorder(
+            Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files, spec.keep_going
+        )
     except OSError as error:
         raise StartError(f"{error.filename}: {error.strerror}") from None
     meet(spec, session, control)
@@ -111,7 +114,10 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
 
 
 class RunRecorder:
-    """Writes a run's ordered messages to run.mcap and into the trace."""
+    """Writes a run's ordered messages to run.mcap and into the trace.
+
+    Both end with the instant at which a robot's state is first not finite, unless the run is to `keep_going`: from then on
+    everything soon is not."""
 
     def __init__(
         self,
@@ -120,18 +126,27 @@ class RunRecorder:
         scenario_toml: str,
         metadata: dict[str, str],
         part_files: Mapping[str, str] = MappingProxyType({}),
+        keep_going: bool = False,
     ) -> None:
         self.recorder = Recorder(folder / "run.mcap", plan, scenario_toml, metadata, part_files)
         self._trace = TraceBuilder(plan)
         self.messages = 0
+        self.lost: Lost | None = None
+        """The first state that is not finite"""
         self._time_ns = 0
         self._bridge = len(plan.formation)
+        self._keep_going = keep_going
 
     def add(self, messages: Sequence[Message]) -> None:
         """Takes messages in order of time."""
         recorder, trace = self.recorder, self._trace
         for message in messages:
+            if self.lost is not None and message.time_ns > self.lost.time_ns:
+                return
             self.messages += 1
+            self._time_ns = message.time_ns
+            if message.channel is Channel.STATE and not self._keep_going and self.lost is None and _is_lost(message):
+                self.lost = Lost(message.source, message.time_ns)
             if message.channel is Channel.FRAMES:
                 if message.source == self._bridge:  # its messages contain the drives' frames, too
                     for timed in unpack(message.values):
@@ -139,13 +154,11 @@ class RunRecorder:
             else:
                 trace.add(message)
                 recorder.record(message)
-        if messages:
-            self._time_ns = messages[-1].time_ns
 
     def progress(self) -> RecorderProgress:
         """Returns the progress of the recording."""
         states_ns, states = self._trace.last() or (0, None)
-        return RecorderProgress(self._time_ns, self.messages, states_ns, states, self.recorder.failure)
+        return RecorderProgress(self._time_ns, self.messages, states_ns, states, self.recorder.failure, self.lost)
 
     def close(self, links: Sequence[LinkCounts]) -> None:
         """Writes the links' counts and ends the recording."""
@@ -154,4 +167,9 @@ class RunRecorder:
 
     def report(self, refused: int = 0) -> RecorderReport:
         """Returns the report with the trace; `refused` is the number of messages that were refused before."""
-        return RecorderReport(self._trace.build(), self.messages, refused, self.recorder.failure)
+        return RecorderReport(self._trace.build(), self.messages, refused, self.recorder.failure, self.lost)
+
+
+def _is_lost(message: Message) -> bool:
+    """Returns whether a value of a message is not finite."""
+    return not all(map(isfinite, message.values.tolist()))

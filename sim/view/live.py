@@ -2,6 +2,7 @@
 
 import sys
 import time
+from math import isfinite
 from typing import Any, TextIO
 
 import numpy as np
@@ -80,7 +81,7 @@ class Display:
 
     def _line(self, progress: Progress) -> str:
         facts = [f"{name} {value}" for name, value in self._facts(progress)]
-        errors = [f"{name} {error:.3g} m" for name, error in self.errors(progress).items()]
+        errors = [f"{name} {_metres(error, 3)}" for name, error in self.errors(progress).items()]
         return f"{progress.phase:>9}  {'  '.join(facts)}{'  |  ' if errors else ''}{'  '.join(errors)}"
 
     def _facts(self, progress: Progress) -> list[tuple[str, str]]:
@@ -110,11 +111,15 @@ class Display:
             table.add_row(Text("bus", style="dim"), progress.bridge.url)
         errors = Table(box=None, padding=(0, 2))
         errors.add_column("block", style="dim")
-        errors.add_column("error [m]", justify="right")
+        errors.add_column("error", justify="right")
         for name, error in self.errors(progress).items():
-            errors.add_row(name, f"{error:.4g}")
+            errors.add_row(name, _metres(error, 4))
         bar = ProgressBar(total=self._plan.duration_ns, completed=progress.time_ns, width=60)
         columns = Table.grid(padding=(0, 6))
         columns.add_row(table, errors)
         title = Text(f"{self._plan.name}: {progress.phase}", style="bold")
         return Group(title, bar, columns)
+
+
+def _metres(error: float, digits: int) -> str:
+    return f"{error:.{digits}g} m" if isfinite(error) else "not finite"

@@ -13,6 +13,7 @@ from echelon.bridge.protocols.frame import Frame
 from echelon.messages import Channel, Message
 from echelon.runtime.wire import encode, join
 from echelon.sim.processes import watchers
+from echelon.sim.processes.to_supervisor import Lost
 from echelon.sim.processes.watchers import Reception, RunRecorder
 from echelon.sim.recording.mcap_reader import read_metadata, read_trace
 from support.invented import METADATA, invented, paper
@@ -116,3 +117,31 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
     assert (result.messages, result.failure) == (len(messages) + 1, None)
     assert read_trace(tmp_path / "run.mcap", paper()).digest() == result.trace.digest()
     assert read_metadata(tmp_path / "run.mcap") == METADATA
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_a_recording_ends_with_the_instant_at_which_a_state_is_not_finite(
+    tmp_path: Path, value: float, keep_going: bool
+) -> None:
+    messages = list(invented(paper(), TICKS))
+    instants = sorted({message.time_ns for message in messages})
+    at_ns, lost = instants[len(instants) // 2], paper().robots[3].index
+    for number, message in enumerate(messages):
+        if message.channel is Channel.STATE and message.source == lost and message.time_ns >= at_ns:
+            values = message.values.copy()
+            values[-1] = value
+            messages[number] = message._replace(values=values)
+    recording = RunRecorder(tmp_path, paper(), "scenario", METADATA, keep_going=keep_going)
+    recording.add(messages)
+    recording.close([])
+    result = recording.report()
+    if keep_going or value == 1e200:  # its square is not finite, but it is
+        assert (result.lost, result.stopped(paper())) == (None, None)
+        assert result.messages == len(messages)
+    else:
+        assert recording.progress().lost == result.lost == Lost(lost, at_ns)
+        assert result.stopped(paper()) == f"the state of g2/r4 is not finite from {at_ns / 1e9:g} s on"
+        assert result.messages == sum(message.time_ns <= at_ns for message in messages)
+        assert {int(times[-1]) for times in result.trace.times_ns} == {at_ns}
+    assert read_trace(tmp_path / "run.mcap", paper()).digest() == result.trace.digest()

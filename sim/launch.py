@@ -29,6 +29,7 @@ class Launch:
     report: bool = True
     quiet: bool = False
     stall_timeout_s: float = 30.0
+    keep_going: bool = False
     replace: bool = False
     """Delete the run of another scenario that `out` holds"""
 
@@ -68,6 +69,7 @@ def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, 
             can_urls=urls,
             display=display,
             stall_timeout_s=options.stall_timeout_s,
+            keep_going=options.keep_going,
         )
     except OSError as error:
         if error.filename is None:  # of a write to a file that was open

@@ -53,12 +53,14 @@ def run(
     replace: bool = False,
     report: bool = False,
     quiet: bool = False,
+    keep_going: bool = False,
 ) -> Run:
     """Runs a scenario and returns what it showed; `run("lab", {"law.lead": 0.0}, engine="inprocess")`.
 
     Like `echelon run`, it leaves a folder (`out`, by default `runs/<scenario>-<utc time>`), and says on standard error how it
-    stands, unless `quiet`.  A run that broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  If
-    `out` holds the run of another scenario, `replace` deletes that.  Raises UserError for what cannot be run."""
+    stands, unless `quiet`.  It stops where a robot's state is first not finite, unless it is to `keep_going`.  A run that
+    broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  If `out` holds the run of another
+    scenario, `replace` deletes that.  Raises UserError for what cannot be run."""
     loaded = load(scenario, changes)
     options = Launch(
         engine=engine,
@@ -67,6 +69,7 @@ def run(
         can=can,
         report=report,
         quiet=quiet,
+        keep_going=keep_going,
         replace=replace,
     )
     return launch(loaded.scenario, loaded.plan, options)

@@ -23,6 +23,7 @@ from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
 from echelon.sim.recording.mcap_reader import read_metadata, read_scenario
+from echelon.sim.run_state import STATE
 
 NOTE: Final = ".echelon.json"
 RECORDING: Final = "run.mcap"
@@ -36,7 +37,7 @@ TABLES: Final = ("csv", "parquet")
 
 def run_files(plan: Plan, bus: bool) -> tuple[str, ...]:
     """Returns the names of the files that a run may write; those of parts that others wrote come on top."""
-    return (EFFECTIVE, RECORDING, CUT, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
+    return (EFFECTIVE, STATE, RECORDING, CUT, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
 
 
 @dataclass(slots=True)
@@ -131,7 +132,7 @@ def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
             toml, metadata = read_scenario(recording), read_metadata(recording)
             buses = tomllib.loads(toml)["can"]["buses"]
             scenario = metadata["scenario"]
-            files |= dict.fromkeys((recording.name, SUMMARY, REPORT, LOG, "torque.dbc"))
+            files |= dict.fromkeys((recording.name, STATE, SUMMARY, REPORT, LOG, "torque.dbc"))
             files |= dict.fromkeys(f"torque-{bus}.dbc" for bus in buses)
             files[EFFECTIVE] = sha256(toml.encode()).hexdigest()
     return (scenario, files) if files else None

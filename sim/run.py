@@ -1,7 +1,7 @@
 """One run from scenario to folder: run it in one process or in many, then write what it leaves.
 
-The folder holds `scenario.toml` (effective), the files of parts that others wrote, `run.mcap`, `can.log`, `torque.dbc`,
-`summary.json` and `report.html`.
+The folder holds `scenario.toml` (effective), the files of parts that others wrote, `run.json`, `run.mcap`, `can.log`,
+`torque.dbc`, `summary.json` and `report.html`.
 """
 
 import os
@@ -31,6 +31,7 @@ from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
 from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
+from echelon.sim.interruption import interruption
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.out_folder import SUMMARY, OutFolder
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
@@ -42,6 +43,7 @@ from echelon.sim.results.records import ProcessResult, RunFacts, Summary
 from echelon.sim.results.rendering import write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+from echelon.sim.run_state import write_state
 from echelon.sim.view.live import Display
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
@@ -58,15 +60,19 @@ def execute(
     can_urls: tuple[str, ...],
     display: Display,
     stall_timeout_s: float = 30.0,
+    keep_going: bool = False,
 ) -> tuple[Summary, Trace]:
     """Runs a plan and writes the run's folder, except for the report; returns its summary and its trace.
 
+    A run ends at the first instant at which a robot's state is not finite, unless it is to `keep_going`.
     Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
     begun, folder = datetime.now(UTC), out.path
     parts = keep_parts(scenario, folder)
     toml = effective_toml(scenario, parts.names)
     out.note((), {EFFECTIVE: toml, **parts.files})
     write_text(folder / EFFECTIVE, toml)
+    buses = dict(zip([bus.name for bus in plan.can.buses], can_urls, strict=False))  # without frames there are no URLs
+    write_state(folder, engine, clock, buses)
     metadata = {
         "scenario": scenario.name,
         "engine": engine,
@@ -76,7 +82,7 @@ def execute(
     }
     metadata |= {package: version(package) for package in PACKAGES} | parts.metadata
     if engine == "inprocess":
-        recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files)
+        recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files, keep_going)
         outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s)
     else:
         outcome = Supervisor(
@@ -90,11 +96,14 @@ def execute(
             part_files=parts.files,
             show=display.show,
             stall_timeout_s=stall_timeout_s,
+            keep_going=keep_going,
         ).run()
     can = outcome.can
     if can is not None and can.referee is None:
         try:
-            can = replace(can, referee=judged(folder / LOG, plan, clock, whole=not outcome.failure))
+            can = replace(
+                can, referee=judged(folder / LOG, plan, clock, whole=not (outcome.failure or outcome.stopped))
+            )
         except PartRunError as error:
             outcome.failure = outcome.failure or str(error)
     display.close()
@@ -132,32 +141,40 @@ def _in_process(
     failure: str | None = None
 
     def pass_on() -> None:
-        gathered.extend(bridge.take(gathered))  # robots speak in their order, instant by instant
-        recording.add(order.push(gathered))
-        gathered.clear()
+        batch = gathered.copy()  # robots speak in their order, instant by instant
+        gathered.clear()  # whatever happens here, nothing is passed on twice
+        recording.add(order.push(batch))
+        recording.add(order.push(bridge.take(batch)))
 
     time_ns = 0
     try:
-        for time_ns in unstalled(plan, engine.instants(), stall_timeout_s):
-            if clock == "wall":
-                pass_on()
-                if (left_s := begun_s + time_ns / 1e9 - time.monotonic()) > 0:
-                    time.sleep(left_s)
-            elif len(gathered) >= 512:
-                pass_on()
-            now_s = time.monotonic()
-            if now_s - shown_s >= 0.2:
-                shown_s = now_s
-                progress.hear(recording.progress())
-                progress.bridge = bridge.progress()
-                recording.recorder.flush_if_due(time.monotonic_ns())
-                display.show(progress)
-            if recording.recorder.failure:
-                failure = f"the recording failed: {recording.recorder.failure}"
-                break
-    except KeyboardInterrupt:
+        with interruption(bridge.interrupt) as interrupted:
+            for time_ns in unstalled(plan, engine.instants(), stall_timeout_s):
+                if clock == "wall":
+                    pass_on()
+                    if (left_s := begun_s + time_ns / 1e9 - time.monotonic()) > 0:
+                        time.sleep(left_s)
+                elif len(gathered) >= 512:
+                    pass_on()
+                now_s = time.monotonic()
+                if now_s - shown_s >= 0.2:
+                    shown_s = now_s
+                    progress.hear(recording.progress())
+                    progress.bridge = bridge.progress()
+                    recording.recorder.flush_if_due(time.monotonic_ns())
+                    display.show(progress)
+                if recording.recorder.failure:
+                    failure = f"the recording failed: {recording.recorder.failure}"
+                    break
+                if interrupted.asked:
+                    failure = "interrupted"
+                    break
+                if recording.lost is not None:
+                    break
+    except (KeyboardInterrupt, SystemExit):
         failure = "interrupted"
-        bridge.interrupt()
+    except PartRunError as error:
+        failure = str(error)
     except TookTooLong as error:
         who = stalled_in(plan, error)
         failure = f"stalled for {stall_timeout_s:.0f} s at t = {time_ns / 1e9:g} s: everyone waits for {who}"
@@ -188,6 +205,7 @@ def _in_process(
         wall_s=wall_s,
         messages=recorded.messages,
         failure=failure,
+        stopped=recorded.stopped(plan),
     )
 
 
@@ -208,6 +226,7 @@ def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: dat
         ticks_per_second=None if factor is None else factor * 1e9 / plan.robots[0].period_ns,
         messages=outcome.messages,
         failure=outcome.failure,
+        stopped=outcome.stopped,
         date=begun.isoformat(timespec="seconds"),
         version=__version__,
         machine=f"{platform.platform()}, {platform.processor() or platform.machine()}, {os.cpu_count()} cores",

@@ -1,5 +1,6 @@
 """Commands about CAN buses: `can`, `referee`, `drives`."""
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -39,13 +40,16 @@ class CanOptions(ListenOptions):
 
 def can(options: CanOptions) -> int:
     """Shows what is on a scenario's buses, wheel by wheel; or what was, in a run."""
-    from echelon.cli.listening import show_again, show_end, show_live
+    from echelon.cli.listening import show_again, show_end, show_growing, show_live
+    from echelon.sim.run_state import goes_on
 
     plan, folder = _plan_of(options)
     if folder is None or options.can is not None:
         if options.speed is not None:
             raise UsageError("--speed: is for a run's folder without --can")
         show_live(plan, options.can, options.seconds, options.json)
+    elif options.speed is None and goes_on(folder):
+        show_growing(plan, folder, options.seconds, options.json)
     elif options.speed is None:
         show_end(plan, folder, options.json)
     elif options.speed > 0:
@@ -69,10 +73,13 @@ def referee(options: RefereeOptions) -> int:
     """Says what breaks the contract on a scenario's buses, or in a run's can.log; 1 if something does."""
     from echelon.cli.listening import judge_live, judge_run, told, verdict
     from echelon.sim.results.rendering import json_text
+    from echelon.sim.run_state import goes_on
 
     plan, folder = _plan_of(options)
     over = folder is not None and options.can is None
     if folder is not None and over:
+        if goes_on(folder):
+            print(f"echelon: {folder}: the run goes on; this is about what its can.log holds by now", file=sys.stderr)
         report = judge_run(plan, folder)
     else:
         report = judge_live(plan, options.can, options.seconds, options.tolerance, quiet=options.json)
@@ -92,9 +99,7 @@ def _plan_of(options: ListenOptions) -> "tuple[Plan, Path | None]":
 
     folder = run_folder(options.scenario)
     if folder is not None and options.overrides:
-        raise UsageError(
-            f"--set {options.overrides[0]}: is for a scenario; {folder} is the folder of a run that is over"
-        )
+        raise UsageError(f"--set {options.overrides[0]}: is for a scenario; {folder} is the folder of a run")
     return read_scenario(options.scenario, options.overrides)[1], folder
 
 
@@ -152,10 +157,11 @@ for a host of yours.  Faults that the scenario has for its drives happen, counte
         work=can,
         about="""\
 Shows the torque, state and faults of every wheel as the frames on the buses say them, with
-rates and loads: live, a table in a terminal or a line each second; or how a run ended.""",
+rates and loads: live, a table in a terminal or a line each second; or how a run ended.  Of a run
+that goes on it follows can.log to the end.""",
         examples={
             "echelon can lab --can socketcan:vcan0": "live",
-            "echelon can runs/demo": "how a run ended",
+            "echelon can runs/demo": "how a run ended, or how it goes",
             "echelon can runs/demo --speed 10.0 --json": "a run ten times as fast as it was, an object each second",
         },
         codes={0: "shown"},

@@ -14,12 +14,14 @@ from rich.text import Text
 
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
+from echelon.bridge.can.canlog import read_lines
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.referee.referee import Referee, judge_log, read_run_log
+from echelon.bridge.referee.referee import Referee, judge_log, of_run, read_run_log
 from echelon.bridge.reports import RefereeReport
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import UsageError
 from echelon.plan.plan import Plan
+from echelon.sim.run_state import goes_on, read_state
 from echelon.sim.view.wheel_table import CanTable, finding_text
 
 TICK_S: Final = 0.1
@@ -29,6 +31,7 @@ SHOW_S: Final = 0.25
 LINE_S: Final = 1.0
 """Between two lines, or two objects of JSON"""
 _AT_ONCE: Final = 256
+_AT_ONCE_BYTES: Final = 1 << 20
 _PAUSE_S: Final = 0.02
 """After an error of a bus, so that it can come back"""
 
@@ -56,15 +59,31 @@ def show_live(
 
 def show_end(plan: Plan, folder: Path, as_json: bool) -> None:
     """Shows how a run ended by its can.log.  Raises UserError."""
-    table = CanTable(plan, Referee(plan), _names(plan))
+    table = CanTable(plan, Referee(plan, tolerance_ns=_told_by(folder, plan)[0]), _names(plan))
     for logged in _read(folder, plan):
         table.take(*logged)
-    table.referee.finish(max(table.time_ns, plan.duration_ns))
+    _finish(table, folder)
     if as_json:
         print(json.dumps(table.data(table.time_ns), allow_nan=False))
     else:
         console = Console()
         console.print(table.render(table.time_ns, console.width))
+
+
+def show_growing(
+    plan: Plan, folder: Path, seconds: float | None, as_json: bool, console: Console | None = None
+) -> None:
+    """Shows a run that goes on by its can.log, as it is written: to its end, until Ctrl-C, or for some seconds.
+
+    The log has the times of the run, whatever its clock; who listens to the bus itself knows only when frames came."""
+    table = CanTable(plan, Referee(plan, tolerance_ns=_told_by(folder, plan)[0]), _names(plan))
+
+    def heard() -> Iterator[Heard]:
+        yield from _follow(folder, plan, seconds)
+        if not goes_on(folder):
+            _finish(table, folder)
+
+    _show(table, heard(), as_json, console or Console())
 
 
 def show_again(plan: Plan, folder: Path, speed: float, seconds: float | None, as_json: bool) -> None:
@@ -87,16 +106,32 @@ def _show(table: CanTable, heard: Iterator[Heard], as_json: bool, console: Conso
 
 
 def judge_run(plan: Plan, folder: Path) -> RefereeReport:
-    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Raises UserError."""
+    """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Of a run that goes on, what there
+    is by now.  Raises UserError."""
+    tolerance_ns, whole = _told_by(folder, plan)
     try:
-        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
-    except (OSError, ValueError, KeyError):
-        run = {}
-    tolerance_ns = plan.can.watchdog_ns // 2 if run.get("clock") == "wall" else None
-    try:
-        return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=not run.get("failure"))
+        return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=whole)
     except OSError as error:
         raise UsageError(f"{folder / LOG}: {error.strerror}") from None
+
+
+def _told_by(folder: Path, plan: Plan) -> tuple[int | None, bool]:
+    """Returns how late a frame of a run may be [ns] (None: as the referee has it), and whether its log must go to its end: not
+    if it goes on or broke off, for what our own stop sends, or does not send any more, is no finding."""
+    state = read_state(folder)
+    try:
+        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
+    except (OSError, ValueError, KeyError, TypeError):
+        run = {}
+    clock = run.get("clock") or (state.clock if state else "")
+    whole = not (run.get("failure") or run.get("stopped") or goes_on(folder))
+    return plan.can.watchdog_ns // 2 if clock == "wall" else None, whole
+
+
+def _finish(table: CanTable, folder: Path) -> None:
+    """Ends the judgement of a run that is over."""
+    whole = _told_by(folder, table.plan)[1]
+    table.referee.finish(max(table.time_ns, table.plan.duration_ns) if whole else table.time_ns)
 
 
 def judge_live(
@@ -195,8 +230,8 @@ def _urls(plan: Plan, wanted: str | None) -> list[str]:
         if url == "auto":
             if not interface_is_up(f"vcan{number}"):
                 raise UsageError(
-                    f"{names[number]}: the bus is not named and there is no vcan{number}; give --can with what "
-                    "`echelon run` says after 'frames on', e.g. --can udp_multicast:239.74.163.2:43113"
+                    f"{names[number]}: the bus is not named and there is no vcan{number}; give --can with what run.json in "
+                    "the run's folder says of `buses`, e.g. --can udp_multicast:239.74.163.2:43113"
                 )
             urls[number] = f"socketcan:vcan{number}"
         elif url.partition(":")[0] == "virtual":
@@ -254,6 +289,29 @@ def _replay(folder: Path, plan: Plan, speed: float, seconds: float | None) -> It
             time.sleep(min(ahead_s, TICK_S))
             yield Heard(round(time_ns - max(0.0, due_s - time.monotonic()) * speed * 1e9), 0, None)
         yield Heard(time_ns, bus, frame)
+
+
+def _follow(folder: Path, plan: Plan, seconds: float | None) -> Iterator[Heard]:
+    """Yields the frames of the can.log of a run that goes on as they are written, to its end or for so many seconds."""
+    path, start_s, time_ns = folder / LOG, time.monotonic(), 0
+    while not path.exists() and goes_on(folder):
+        yield Heard(0, 0, None)
+        time.sleep(TICK_S)
+    try:
+        with path.open(encoding="ascii", errors="replace") as log:
+            rest, over = "", False
+            while not over and (seconds is None or time.monotonic() - start_s < seconds):
+                over = not goes_on(folder)  # asked before the log is read: what comes between is in it
+                *lines, rest = (rest + log.read(_AT_ONCE_BYTES)).split("\n")
+                for time_ns, bus, frame in of_run(read_lines(lines), plan):
+                    yield Heard(time_ns, bus, frame)
+                if lines:
+                    over = False
+                    continue
+                yield Heard(time_ns, 0, None)
+                time.sleep(0 if over else TICK_S)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
 
 
 def _read(folder: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:

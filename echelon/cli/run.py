@@ -37,6 +37,9 @@ class RunOptions(ScenarioOptions):
     json: bool = field(default=False, metadata=option("print the summary as JSON"))
     quiet: bool = field(default=False, metadata=option("show no progress"))
     no_report: bool = field(default=False, metadata=option("write no report.html"))
+    keep_going: bool = field(
+        default=False, metadata=option("go on though a robot's state is not finite; otherwise the run stops there")
+    )
     stall_timeout: float = field(
         default=30.0,
         metadata=option("give a run up that stands still for so long, in virtual time", "S", parse=seconds),
@@ -67,6 +70,7 @@ def run(options: RunOptions) -> int:
                 report=not options.no_report,
                 quiet=options.quiet,
                 stall_timeout_s=options.stall_timeout,
+                keep_going=options.keep_going,
                 replace=options.replace,
             ),
         )
@@ -91,7 +95,8 @@ COMMANDS: Final = (
         work=run,
         about="""\
 Runs a scenario and leaves one folder: report.html, run.mcap (for Foxglove, PlotJuggler and the
-like), can.log, torque.dbc, summary.json, and scenario.toml with every default written out.
+like), can.log, torque.dbc, summary.json, run.json (where its buses are, from the start), and
+scenario.toml with every default written out.
 Given the folder of a run, it runs that scenario again, into a new folder.""",
         examples={
             "echelon run paper": "the paper's nine robots, thirteen processes over Zenoh",

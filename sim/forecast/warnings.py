@@ -6,13 +6,14 @@ from echelon.plan.plan import Plan
 from echelon.sim.forecast.links import link_warnings
 from echelon.sim.forecast.motion import motion_warnings
 from echelon.sim.forecast.sampling import sampling_warnings
+from echelon.sim.results.beforehand import beforehand
 
 
 def warnings(plan: Plan) -> tuple[str, ...]:
     """Returns a line for each thing that is hardly meant; none if there is nothing to say."""
     return (
         *_heading_warnings(plan),
-        *_claim_warnings(plan),
+        *beforehand(plan),
         *link_warnings(plan),
         *sampling_warnings(plan),
         *motion_warnings(plan),
@@ -29,14 +30,4 @@ def _heading_warnings(plan: Plan) -> list[str]:
     return [
         f"heading = {first.heading:g} ({first.name}{more}): is in radians, and {abs(degrees(first.heading)) / 360:.3g} turns; "
         f"if degrees were meant, write {radians(first.heading):.5g}"
-    ]
-
-
-def _claim_warnings(plan: Plan) -> list[str]:
-    """A claim about an instant that the run does not reach."""
-    duration = plan.duration_ns / 1e9
-    return [
-        f"claims.{at}.settled_by = {claim.settled_by:g}: the run ends before, at {duration:g} s"
-        for at, claim in enumerate(plan.claims)
-        if claim.settled_by > duration
     ]

@@ -86,10 +86,11 @@ def _whole(evidence: Evidence) -> Iterator[CheckResult]:
     def told(outcome: Outcome, text: str, about: Sequence[str] = ()) -> CheckResult:
         return CheckResult("whole", outcome, text, end_s, "s", wanted_s, tuple(about))
 
+    at = "before it began" if end_s is None else f"at {end_s:g} s of {wanted_s:g} s"
     if run.failure:
-        yield told("failed", run.failure.splitlines()[0])
+        yield told("failed", f"{at}: {run.failure.splitlines()[0]}")
+        return
     if run.stopped:
-        at = "before it began" if end_s is None else f"at {end_s:g} s of {wanted_s:g} s"
         yield told("failed", f"the run was stopped {at}")
         return
     # The last instant that all robots share may be one period of the coordinator before the end.
@@ -107,7 +108,7 @@ def _whole(evidence: Evidence) -> Iterator[CheckResult]:
         yield told("failed", f"ended early: {shown} of {wanted_s:g} s", list(early))
     elif end_ns is None or end_ns < needed_ns:
         yield told("failed", f"the robots have no instant in common at the end of {wanted_s:g} s")
-    elif not run.failure:
+    else:
         yield told("passed", f"the run reached {end_s:g} s of {wanted_s:g} s")
 
 
@@ -143,11 +144,13 @@ def _growth(evidence: Evidence) -> Iterator[CheckResult]:
         yield CheckResult("growth", "failed", f"{name} {ending.text}", growth, "", bound, (name,))
     if judged and not growing:
         growth, name, ending = max(judged, key=lambda found: (found[2].level > found[2].floor, found[0]))
-        what = f"{growth:.3g} times as large in the last sixth of the run as before"
         if ending.level <= ending.floor:
             text = f"no error grows; all are at most {max(one.floor for _, _, one in judged):.3g} m by then"
         else:
-            text = f"no error grows; that of {name} is {what}, {ending.level:.3g} m"
+            text = (
+                f"no error grows; that of {name} is {growth:.3g} times as large in the last sixth of the run as before"
+            )
+            text += f", {ending.level:.3g} m: {ending.spared}" if ending.spared else ""
         yield CheckResult("growth", "passed", text, growth, "", bound, tuple(name for _, name, _ in judged))
     yield from _too_short("growth", evidence)
 
@@ -234,7 +237,9 @@ def _saturation(evidence: Evidence) -> Iterator[CheckResult]:
     shares = [(row.saturation_share, row.robot) for row in limited if row.saturation_share is not None]
     if not limited:
         yield CheckResult("saturation", "not tested", "no robot has a limit of torque or speed", None, "", bound)
-    elif shares:
+    elif not shares:
+        yield CheckResult("saturation", "not tested", "nobody knows for how long limits acted", None, "", bound)
+    else:
         share, robot = max(shares)
         over = tuple(name for each, name in sorted(shares, reverse=True) if each > bound)
         more = f", and those of {len(over) - 1} more for more than {100 * bound:g} %" if len(over) > 1 else ""
@@ -245,6 +250,8 @@ def _saturation(evidence: Evidence) -> Iterator[CheckResult]:
 def _messages(evidence: Evidence) -> Iterator[CheckResult]:
     links = evidence.links
     if not links:
+        if evidence.plan.links:
+            yield CheckResult("messages", "not tested", "nobody counted the messages of the links", unit="links")
         return
     unused = [row for row in links if not row.used]
     none_came = [row for row in unused if not row.delivered]
@@ -323,7 +330,10 @@ def _drives(evidence: Evidence) -> Iterator[CheckResult]:
 
 def _referee(evidence: Evidence) -> Iterator[CheckResult]:
     can = evidence.can
-    if can is None or can.referee is None or not can.frames:
+    if can is None or can.referee is None:
+        return
+    if not can.referee.frames:
+        yield CheckResult("referee", "not tested", "no frame was on the bus", unit="findings")
         return
     total = sum(can.referee.kinds.values())
     text = finding_text(can.referee) if total else f"nothing breaks the contract in {can.referee.frames} frames"

@@ -4,7 +4,8 @@ The last third of the run is looked at, in two halves: the sixth before the last
 mean square of its amplitude (`rates`) is more than `health.growth` times as large in the last sixth as in the one before, and
 larger than what is not judged: `health.floor`; what a moving formation cannot know, its speed times the ages of what it acts
 on (`ages`); and σ times what the velocity of the trajectory jumps by.  An error within 5 % of what the block started with may
-move from one steady value to another: it must have grown in the sixth before, too.
+move from one steady value to another, or begin to tremble, with friction or steps of torque: it grows only if it grew in the
+sixth before, too, and would leave those 5 % if it went on like that for as long as the run has lasted.
 
 It is a *steady lag* if it is a constant time times the velocity of the trajectory, a *steady error* if it is constant; to nine
 tenths of its mean square, and within the same bound from one sixth to the next.
@@ -31,6 +32,8 @@ EXPLAINED: Final = 0.9
 """Share of an error's mean square that a constant explains, if it is one"""
 SMALL: Final = 0.05
 """Errors up to this share of what a block started with must grow for longer to count as growing"""
+SIXTHS: Final = 6
+"""Of a run"""
 FALLS: Final = 0.9
 """An error that is less than so many times what it was a sixth of the run before falls"""
 Kind = Literal["at rest", "falls", "grows", "oscillates", "steady lag", "steady error", "not finite", "too short"]
@@ -50,6 +53,8 @@ class Ending:
     floor: float
     """What is not judged [m]"""
     fit: Fit | None
+    spared: str = ""
+    """Why it does not count as growing though it grew by more than `health.growth`; empty where it did not, or counts"""
 
     @property
     def judged(self) -> bool:
@@ -70,7 +75,7 @@ def endings(plan: Plan, blocks: Blocks, links: Sequence[LinkCounts]) -> tuple[En
     """Returns how each block ended, in the order of the plan."""
     times_ns = blocks.times_ns
     if not len(times_ns):
-        return tuple(Ending("too short", "there is nothing", None, 0.0, 0.0, None) for _ in blocks.series)
+        return tuple(Ending("too short", "was never recorded", None, 0.0, 0.0, None) for _ in blocks.series)
     reference = _reference(blocks)
     jitter, lags = loop_jitter(plan, links), lag_times(plan, links)
     found = []
@@ -101,7 +106,7 @@ def _reference(blocks: Blocks) -> _Reference:
 
 def _part_ns(times_ns: NDArray[np.int64], sixths: int) -> int:
     """Returns when so many sixths of the run are over."""
-    return int(times_ns[0]) + (int(times_ns[-1]) - int(times_ns[0])) * sixths // 6
+    return int(times_ns[0]) + (int(times_ns[-1]) - int(times_ns[0])) * sixths // SIXTHS
 
 
 def _sixth(times_ns: NDArray[np.int64], number: int) -> NDArray[np.bool_]:
@@ -126,13 +131,19 @@ def _ending(
     with np.errstate(all="ignore"):
         fit = decay(times_ns, sizes, _rms(sizes[last]))
     if int(times_ns[-1]) - int(times_ns[0]) < 3 * wait_ns or not before.any():
-        text = f"a third of the run is shorter than {wait_ns / 1e9:.4g} s, its dwell time"
+        text = f"cannot be judged, for a third of the run is shorter than {wait_ns / 1e9:.4g} s, its dwell time"
         return Ending("too short", text, None, _rms(sizes[last]), floor, fit)
     earlier, level = _rms(sizes[before]), _rms(sizes[last])
     growth = level / earlier if earlier > 0 else 1.0 if level <= ROUNDING else float("inf")
 
+    begun = start_error(series, times_ns) or 0.0
+    spared = ""
+    if growth > bound:
+        spared = _spared(level, earlier, _rms(sizes[sooner]), floor, begun, bound)
+
     def ended(kind: Kind, text: str) -> Ending:
-        return Ending(kind, text, growth, level, floor, fit)
+        why = "" if kind == "grows" or growth <= bound else spared or f"it {text}"
+        return Ending(kind, text, growth, level, floor, fit, why)
 
     end, mean = float(series.norm[-1]), _rms(series.norm[last])
     if end <= ROUNDING and level <= ROUNDING:
@@ -142,8 +153,7 @@ def _ending(
     if beside and _constant(series.error, velocity, before, last, bound):
         return ended("steady lag", f"keeps a steady lag of {mean:.3g} m{beside}")
     oscillates = _oscillates(series, times_ns >= _part_ns(times_ns, 3))
-    small = level <= SMALL * (start_error(series, times_ns) or 0.0) and earlier <= bound * _rms(sizes[sooner])
-    if growth > bound and level > floor and not small:
+    if growth > bound and not spared:
         rate = f", {-fit.rate:+.3g} 1/s" if fit is not None and fit.rate < 0 else ""
         how = "oscillates with growing amplitude" if oscillates else "diverges"
         return ended("grows", f"{how}: {earlier:.3g} m, then {level:.3g} m, {growth:.3g} times as much{rate}")
@@ -154,6 +164,22 @@ def _ending(
     if oscillates:
         return ended("oscillates", f"keeps oscillating at about {mean:.3g} m{beside}")
     return ended("steady error", f"stays at about {mean:.3g} m{beside}")
+
+
+def _spared(level: float, earlier: float, sooner: float, floor: float, begun: float, bound: float) -> str:
+    """Returns why an error that grew does not count as growing; empty if it counts.  `level`, `earlier` and `sooner` are its
+    amplitude in the last three sixths of the run, the last one first."""
+    if level <= floor:
+        return f"it is within {floor:.3g} m, which is not judged"
+    share = SMALL * begun
+    if level > share:
+        return ""
+    within = f"it is within {100 * SMALL:g} % of what it began with, {share:.3g} m"
+    if earlier <= bound * sooner:
+        return f"{within}, and did not grow before that"
+    if level * min(level / earlier, 1e9) ** SIXTHS <= share:
+        return f"{within}, and would be for another run of this length"
+    return ""
 
 
 def _constant(

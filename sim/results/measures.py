@@ -118,7 +118,8 @@ def claim_results(plan: Plan, blocks: Blocks, endings: Sequence[Ending]) -> tupl
         measured = _slowest(times.values())
         told = [_told(name, settling, ending, by_ns) for name, settling, ending in found]
         outcome: Outcome
-        if end_ns is None or by_ns > end_ns:
+        lost = any(ending.kind == "not finite" for _, _, ending in found)
+        if end_ns is None or (by_ns > end_ns and not lost):
             ended = "nothing was simulated" if end_ns is None else f"the run ended at {end_ns / 1e9:g} s"
             outcome, why = "not tested", ended
         else:

@@ -76,6 +76,7 @@ class Verdict:
         """The word, and what it stands on."""
         claims, others = len(self.claims), [check.outcome for check in self.checks if check.name != CLAIM]
         passed = f"{count(others.count('passed'), 'check')} passed"
+        passed += f", {len(self.not_tested)} not tested" if self.not_tested else ""
         match self.word:
             case "HOLDS":
                 return f"HOLDS: {count(claims, 'claim')} and {passed}"

@@ -94,8 +94,9 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
     if summary.links:
         sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
-        age = max((link.age_max for link in summary.links if link.age_max is not None), default=None)
-        yield f"  links    {sent} messages, {lost} lost, oldest in use {number(age, 's')}"
+        ages = [link.age_max for link in summary.links if link.age_max is not None]
+        oldest = f"oldest in use {number(max(ages), 's')}" if ages else "nothing was ever used"
+        yield f"  links    {sent} messages, {lost} lost, {oldest}"
     yield from can_lines(summary.can)
     run = summary.run
     if run.clock == "wall" and run.stages:

@@ -18,7 +18,6 @@ from echelon.scenario.tables import Scenario
 from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import REGISTRY, parse
-from echelon.sim.results.records import Verdict
 from echelon.sim.results.rendering import summary_schema
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import TraceBuilder
@@ -144,7 +143,7 @@ def test_a_new_scenario_is_tame_and_holds(groups: str, drive: str | None) -> Non
     )
     assert all(fit.fits for fit in plan_fit(plan))
     summary = verdict(text)
-    assert summary.verdict == Verdict(True, ())
+    assert summary.verdict.word == "HOLDS"
     assert summary.claims
     assert all(row.saturation_share == 0 for row in summary.torque)
 
@@ -204,7 +203,7 @@ def test_the_schema_has_exactly_the_keys_that_are_known() -> None:
     assert '"null"' not in json.dumps(schema)
     assert ": null" not in json.dumps(schema)
     assert schema["$defs"]["RobotTable"]["properties"]["heading"]["description"].endswith(
-        "in radians [rad]; 0 unless given"
+        "x axis [rad]; 0 unless given"
     )
     assert "[°]" in schema["$defs"]["Shape"]["properties"]["rotation"]["description"]
 

@@ -104,6 +104,7 @@ def test_parts_that_do_not_act_on_each_other_change_nothing(tree, seed, T):
         assert radius_of(plan, k) == pytest.approx(np.abs(np.linalg.eigvals(histories(plan, k))).max(), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_boundary_is_that_of_the_loop_run_tick_by_tick(seed):
     """Random gains and couplings: around the boundary the run grows or decays as the radius says, and at that rate."""
@@ -129,7 +130,7 @@ def test_paper_bears_six_milliseconds_and_not_seven():
 
 
 @pytest.mark.parametrize("sigma", [1.0, 0.1, 0.01])
-def test_margin_of_the_theory_page(sigma):
+def test_margin_of_the_architecture_page(sigma):
     assert margin_of(1 / sigma**2, 1 / sigma) == pytest.approx(0.7112 * sigma, rel=2e-4)
 
 

@@ -73,7 +73,7 @@ def test_what_is_not_there_is_named(lab: echelon.Run) -> None:
 
 
 def test_the_summary_is_in_the_attributes(lab: echelon.Run) -> None:
-    assert lab.verdict.holds is lab.holds
+    assert (lab.verdict.word, lab.holds) == ("HEALTHY", False)
     assert lab.failure is None
     assert (lab.scenario, lab.duration, lab.claims) == ("lab", 0.5, ())
     assert lab.distance.smallest > 0
@@ -94,7 +94,11 @@ def test_data_frames(lab: echelon.Run) -> None:
 def test_figures(lab: echelon.Run, name: str, tmp_path: Path) -> None:
     picture = lab.figure(name)
     assert picture._repr_svg_().startswith("<svg")
-    picture.save(tmp_path / "picture.svg")
+    for kind in ("svg", "pdf", "png"):
+        picture.save(tmp_path / f"picture.{kind}")
+        before = (tmp_path / f"picture.{kind}").read_bytes()
+        picture.save(tmp_path / f"picture.{kind}")
+        assert (tmp_path / f"picture.{kind}").read_bytes() == before
     assert (tmp_path / "picture.svg").read_text(encoding="utf-8") == picture.svg
     with pytest.raises(ValueError, match="must end in"):
         picture.save(tmp_path / "picture.gif")

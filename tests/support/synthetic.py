@@ -1,6 +1,6 @@
 """A run with known numbers: the paper's plan with errors that decay exponentially, each layer with its own time constant."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +12,12 @@ from echelon.bridge.reports import BusReport, CanReport
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
-from echelon.plan.plan import Plan
+from echelon.plan.plan import BlockPlan, Plan
 from echelon.runtime.link import LinkCounts
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.loading import load
-from echelon.sim.results.records import RunFacts
+from echelon.sim.results.records import ClaimResult, RunFacts
+from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
 
 PAPER = shipped.FOLDER / "paper.toml"
@@ -48,31 +49,45 @@ class Run:
         return self.trace.plan
 
 
+Motion = Callable[[BlockPlan, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""Returns the error of a block and its rate, (T, size) each, at instants [s]"""
+
+
 def decaying(overrides: Sequence[str] = (), times_ns: NDArray[np.int64] | None = None) -> Run:
     """Returns a run with e_b(t) = e_b(0) exp(-t/decay) in positions, velocities and headings; all torques are zero."""
+    start = {}
+
+    def motion(block: BlockPlan, seconds: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        number = len(start) + 1
+        start[block.name] = np.linspace(0.3 * number, 0.5 * number, block.size)
+        error = start[block.name] * np.exp(-seconds / DECAY[block.layer])[:, None]
+        return error, -error / DECAY[block.layer]
+
     scenario, plan = load(PAPER, [*PINNED, *overrides])
+    return Run(scenario, of_errors(plan, motion, times_ns), start)
+
+
+def of_errors(plan: Plan, motion: Motion, times_ns: NDArray[np.int64] | None = None) -> Trace:
+    """Returns the trace of a run whose blocks have given errors; headings differ, all torques are zero."""
     if times_ns is None:
-        times_ns = np.arange(0, plan.duration_ns + 1, PERIOD_NS)
+        times_ns = np.arange(0, plan.duration_ns + 1, plan.root.period_ns)
     seconds = times_ns / 1e9
     transformation = Transformation(plan)
     reference = sample(make_trajectory(plan.trajectory), seconds)
     z = transformation.desired(reference[:, 0]).reshape(len(seconds), -1)
     rate = np.zeros_like(z)
     rate[:, -2:] = reference[:, 1]
-    start = {}
-    for number, block in enumerate(plan.blocks, start=1):
+    for block in plan.blocks:
         at = slice(block.offset, block.offset + block.size)
-        start[block.name] = np.linspace(0.3 * number, 0.5 * number, block.size)
-        decay = DECAY[block.layer]
-        error = start[block.name] * np.exp(-seconds / decay)[:, None]
+        error, error_rate = motion(block, seconds)
         z[:, at] += error
-        rate[:, at] -= error / decay
+        rate[:, at] += error_rate
     shape = (len(seconds), len(plan.robots), 2)
     states = np.zeros((*shape[:2], len(STATE_FIELDS)))
     states[:, :, [FIELD["x"], FIELD["y"]]] = transformation.backward(z.reshape(shape))
     states[:, :, [FIELD["vx"], FIELD["vy"]]] = transformation.backward(rate.reshape(shape))
     states[:, :, FIELD["theta"]] = np.linspace(0, 1, shape[1])
-    return Run(scenario, of_states(plan, times_ns, states), start)
+    return of_states(plan, times_ns, states)
 
 
 def at_places(places: NDArray[np.float64], overrides: Sequence[str] = (), period_ns: int = PERIOD_NS) -> Trace:
@@ -108,6 +123,11 @@ def run_facts(**given: Any) -> RunFacts:
     """Returns the facts of a run; `given` replaces some of them."""
     facts = RunFacts("inprocess", "virtual", 6.0, 0.0, 2.0, 200.0, 0, None)
     return replace(facts, **given)
+
+
+def claims_of(trace: Trace) -> tuple[ClaimResult, ...]:
+    """Returns the results of the claims of a run."""
+    return summarise(trace, (), None, run_facts()).claims
 
 
 def can_report(**given: Any) -> CanReport:

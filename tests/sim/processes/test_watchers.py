@@ -1,4 +1,4 @@
-"""Those who watch a run get its messages in order, count what is none, and end with all that was sent."""
+"""Watchers get the messages of a run in order, count invalid ones, and end with all that was sent."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from echelon.bridge.protocols.frame import Frame
 from echelon.messages import Channel, Message
 from echelon.runtime.wire import encode, join
 from echelon.sim.processes import watchers
+from echelon.sim.processes.to_supervisor import Lost
 from echelon.sim.processes.watchers import Reception, RunRecorder
 from echelon.sim.recording.mcap_reader import read_metadata, read_trace
 from support.invented import METADATA, invented, paper
@@ -21,7 +22,7 @@ TICKS = 6
 
 
 class Inbox:
-    """Gives out what it was given, one portion at a time; nothing when that is all."""
+    """Stands for the session: returns the given portions of batches one by one, then nothing."""
 
     def __init__(self, *portions: list[bytes]) -> None:
         self.portions = list(portions)
@@ -42,12 +43,12 @@ def batches_by_source(messages: list[Message]) -> list[bytes]:
 
 
 def reception(inbox: Any) -> Reception:
-    """Returns the reception of the paper's members."""
+    """Returns a reception for the members of the paper's scenario."""
     return Reception(inbox, range(len(paper().formation)), paper())
 
 
 def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
-    """Returns what messages are ordered by."""
+    """Returns the keys of the order of messages."""
     return [(each.time_ns, each.source, each.channel) for each in messages]
 
 
@@ -65,7 +66,7 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
     good = batches_by_source(messages)
     size = messages[0].values.size
     strangers = [Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))]
-    leader, root = paper().nodes[0], paper().root  # one has no nodes below it, the other no parent and no robots
+    leader, root = paper().nodes[0], paper().root  # the leader has no child nodes; the root has no parent and no robots
     for node, channel in ((leader, Channel.REFERENCE), (root, Channel.GROUP_STATE), (root, Channel.COMMAND)):
         strangers.append(Message(channel, node.index, 0, 0, np.zeros(6)))
     stranger = batch(strangers)
@@ -94,7 +95,7 @@ def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.Monk
     silent = Inbox(*parts[:3], [], *parts[3:])  # a broken run: after silence nothing is waited for
     out = [m for portion in reception(silent).drain(None) for m in portion]
     assert {m.source for m in out} == {0, 1, 2}
-    monkeypatch.setattr(watchers, "DRAIN_S", 0.05)  # what never comes is not waited for for ever
+    monkeypatch.setattr(watchers, "DRAIN_S", 0.05)  # the wait for missing messages ends
     assert keys([m for portion in reception(Inbox(*parts[:3])).drain(999) for m in portion]) == sorted(keys(out))
 
 
@@ -116,3 +117,31 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
     assert (result.messages, result.failure) == (len(messages) + 1, None)
     assert read_trace(tmp_path / "run.mcap", paper()).digest() == result.trace.digest()
     assert read_metadata(tmp_path / "run.mcap") == METADATA
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_a_recording_ends_with_the_instant_at_which_a_state_is_not_finite(
+    tmp_path: Path, value: float, keep_going: bool
+) -> None:
+    messages = list(invented(paper(), TICKS))
+    instants = sorted({message.time_ns for message in messages})
+    at_ns, lost = instants[len(instants) // 2], paper().robots[3].index
+    for number, message in enumerate(messages):
+        if message.channel is Channel.STATE and message.source == lost and message.time_ns >= at_ns:
+            values = message.values.copy()
+            values[-1] = value
+            messages[number] = message._replace(values=values)
+    recording = RunRecorder(tmp_path, paper(), "scenario", METADATA, keep_going=keep_going)
+    recording.add(messages)
+    recording.close([])
+    result = recording.report()
+    if keep_going or value == 1e200:  # its square is not finite, but it is
+        assert (result.lost, result.stopped(paper())) == (None, None)
+        assert result.messages == len(messages)
+    else:
+        assert recording.progress().lost == result.lost == Lost(lost, at_ns)
+        assert result.stopped(paper()) == f"the state of g2/r4 is not finite from {at_ns / 1e9:g} s on"
+        assert result.messages == sum(message.time_ns <= at_ns for message in messages)
+        assert {int(times[-1]) for times in result.trace.times_ns} == {at_ns}
+    assert read_trace(tmp_path / "run.mcap", paper()).digest() == result.trace.digest()

@@ -1,0 +1,140 @@
+"""Runs that diverge stop, runs that are interrupted end between two instants, and both leave a folder that says so."""
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from echelon.cli import main
+from echelon.cli.listening import show_growing
+from echelon.sim.interruption import interruption
+from echelon.sim.run_folder import open_run
+from echelon.sim.run_state import goes_on, read_state
+from support.runs import echelon, plan_of, start_echelon, summary_of, until
+
+DIVERGING = ("--set", "claims=[]", "--set", "links=[{channel='state', delay=0.007}]", "--set", "duration=2.0")
+"""The paper's robots bear 6 ms (`echelon analyse paper`)"""
+QUIET = ("--can", "none", "--quiet", "--no-report")
+CLOSED = ("--set", "can.path=closed", "--set", "claims=[]", "--quiet", "--no-report")
+
+
+def ran(engine: str, folder: Path, *options: str) -> dict[str, Any]:
+    done = echelon("run", "paper", "--engine", engine, *DIVERGING, *QUIET, "--out", folder, *options)
+    assert done.returncode == 1, done.stderr  # nothing failed; the verdict does
+    assert not [line for line in done.stderr.splitlines() if "Warning" in line]
+    return summary_of(folder)
+
+
+@pytest.fixture(scope="module")
+def in_process(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    folder = tmp_path_factory.mktemp("diverged") / "run"
+    return ran("inprocess", folder), folder
+
+
+def test_a_diverged_run_stops_at_the_first_state_that_is_not_finite(in_process: tuple[dict[str, Any], Path]) -> None:
+    summary, folder = in_process
+    checks = {check["name"]: check for check in summary["verdict"]["checks"]}
+    assert checks["whole"]["outcome"] == checks["finite"]["outcome"] == "failed"
+    assert checks["whole"]["text"] == f"the run was stopped at {summary['simulated']:g} s of 2 s"
+    assert summary["simulated"] < 1
+    assert f"is not finite from {summary['simulated']:g} s on" in summary["run"]["stopped"]
+    assert summary["run"]["failure"] is None
+    assert open_run(folder).trace.digest() == summary["trace_digest"]
+
+
+def test_processes_stop_with_the_same_states(in_process: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
+    summary = ran("processes", tmp_path / "run")
+    assert summary["trace_digest"] == in_process[0]["trace_digest"]
+    assert summary["run"]["stopped"] == in_process[0]["run"]["stopped"]
+    assert min(row["sent"] for row in summary["links"]) > 0  # what links counted is told though the run broke off
+
+
+def test_keep_going_goes_on(in_process: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
+    summary = ran("inprocess", tmp_path / "run", "--keep-going")
+    assert summary["simulated"] == 2.0
+    assert summary["run"]["stopped"] is None
+    outcomes = {check["name"]: check["outcome"] for check in summary["verdict"]["checks"]}
+    assert (outcomes["whole"], outcomes["finite"]) == ("passed", "failed")
+
+
+def interrupted(folder: Path, scenario: str, *options: str) -> dict[str, Any]:
+    """Interrupts a run in one process once it has written some hundred frames; returns its summary."""
+    run = ("--engine", "inprocess", "--set", "duration=1000", *options)
+    command = start_echelon("run", scenario, *run, *CLOSED, "--out", folder)
+    log = folder / "can.log"
+    assert until(lambda: log.exists() and log.stat().st_size > 400_000, 60), command.communicate(timeout=5)
+    command.send_signal(signal.SIGINT)
+    _, err = command.communicate(timeout=60)
+    assert command.returncode == 3
+    assert err.splitlines()[-1] == "echelon: interrupted"
+    return summary_of(folder)
+
+
+@pytest.mark.parametrize("scenario", ["lab", "drives"])
+def test_the_frames_of_our_own_stop_are_no_findings(scenario: str, tmp_path: Path) -> None:
+    summary = interrupted(tmp_path / "run", scenario)
+    outcomes = {check["name"]: check for check in summary["verdict"]["checks"]}
+    assert outcomes["referee"]["outcome"] == "passed", outcomes["referee"]
+    assert outcomes["recording"]["outcome"] == "passed", outcomes["recording"]
+    assert [check["name"] for check in summary["verdict"]["checks"] if check["outcome"] == "failed"] == ["whole"]
+    assert "s of 1000 s: interrupted" in outcomes["whole"]["text"]
+    assert main(["referee", str(tmp_path / "run")]) == 0  # who looks again finds nothing, either
+
+
+def test_an_interruption_is_noted_first_and_raised_the_second_time() -> None:
+    calls: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+    with interruption(lambda: calls.append(1)) as noted:
+        assert not noted.asked
+        signal.raise_signal(signal.SIGINT)
+        assert (noted.asked, calls) == (True, [1])
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_run_says_where_its_buses_are_and_can_be_looked_at_while_it_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    command = start_echelon("run", "lab", "--set", "duration=12", "--can", "auto", *CLOSED, "--out", folder)
+    try:
+        log = folder / "can.log"
+        assert until(lambda: log.exists() and log.stat().st_size > 100_000, 60), command.communicate(timeout=5)
+        assert goes_on(folder)
+        state = read_state(folder)
+        assert state is not None
+        assert (state.pid, state.engine, state.clock) == (command.pid, "processes", "virtual")
+        assert state.buses.keys() == {"can0"}
+        assert state.buses["can0"].partition(":")[0] in ("udp_multicast", "socketcan")
+        assert main(["referee", str(folder)]) == 0
+        so_far = capsys.readouterr()
+        assert "the run goes on" in so_far.err
+        assert so_far.out.endswith(" frames of 27 identifiers: no findings\n")
+        assert main(["can", str(folder), "--json", "--seconds", "0.5"]) == 0
+        first = json.loads(capsys.readouterr().out.splitlines()[-1])
+        assert first["frames"] > 0
+        show_growing(
+            plan_of("lab", "can.path=closed", "duration=12"), folder, None, as_json=True
+        )  # to the end of the run
+        shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        assert shown[-1]["frames"] > first["frames"]
+        assert shown[-1]["kinds"] == {}
+        command.communicate(timeout=60)
+    finally:
+        command.kill()
+    assert not goes_on(folder)
+    assert shown[-1]["frames"] == summary_of(folder)["can"]["frames"]
+
+
+def test_a_killed_run_does_not_go_on(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = start_echelon("run", "lab", "--engine", "inprocess", "--set", "duration=1000", *CLOSED, "--out", folder)
+    assert until(lambda: (folder / "can.log").exists(), 60), command.communicate(timeout=5)
+    assert goes_on(folder)
+    command.kill()
+    command.wait()
+    assert not goes_on(folder)
+    assert not goes_on(tmp_path)

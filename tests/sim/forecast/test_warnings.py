@@ -37,8 +37,8 @@ def test_a_heading_that_looks_like_degrees() -> None:
 
 
 def test_a_claim_beyond_the_end() -> None:
-    assert only(plan_of("lab", "duration=15.0")) == (
-        "claim: centroid by 20 s cannot be tested, for the run ends at 15 s; a claim that is not tested fails"
+    assert only(plan_of("lab", "duration=19.0")) == (
+        "claim: centroid by 20 s cannot be tested, for the run ends at 19 s; a claim that is not tested fails"
     )
     assert warnings(plan_of("lab", "duration=20.0")) == ()
 
@@ -61,10 +61,8 @@ def test_links_that_do_something_else_than_they_seem_to(rule: str, says: str) ->
 
 @pytest.mark.parametrize("rule", ['{channel="state", delay=41.0}', '{channel="state", loss=1.0}'])
 def test_links_over_which_nothing_arrives(rule: str) -> None:
-    assert any(
-        line.startswith("messages: nothing can arrive over 9 of 24 links")
-        for line in warnings(plan_of("lab", f"links=[{rule}]"))
-    )
+    found = warnings(plan_of("lab", f"links=[{rule}]"))
+    assert any(line.startswith("messages: nothing can arrive over 9 of 24 links") for line in found)
 
 
 def test_what_a_rounded_delay_is_said_to_act_as_is_what_the_run_does() -> None:
@@ -73,7 +71,7 @@ def test_what_a_rounded_delay_is_said_to_act_as_is_what_the_run_does() -> None:
         trace_of(plan_of("lab", *short, f'links=[{{channel="state", delay={delay}}}]')) for delay in (0.004, 0.01)
     )
     assert rounded.digest() == whole.digest()
-    assert warnings(whole.plan) == ()
+    assert not any("acts as" in line for line in warnings(whole.plan))
 
 
 def test_on_the_closed_path_commands_are_used_at_torque_periods() -> None:

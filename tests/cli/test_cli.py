@@ -307,17 +307,6 @@ def test_validate_explains_and_speaks_json() -> None:
     assert "can0 fits" in json.loads(echelon("validate", "lab", "--json").stdout)["can"][0]
 
 
-def test_analyse_puts_the_boundary_between_six_and_seven_milliseconds() -> None:
-    done = echelon("analyse", "paper", "--json")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
-    assert facts["largest_stable_delay"] == pytest.approx(0.006)
-    assert facts["spectral_radius"]["6"] < 1 < facts["spectral_radius"]["7"]
-    margins = [facts["blocks"][name]["delay_margin"] for name in ("g1", "inter", "centroid")]
-    assert margins == pytest.approx([0.0071117, 0.071117, 0.71117], rel=1e-4)
-    assert "7 ticks" in echelon("analyse", "paper").stdout
-
-
 def test_dbc_is_what_candump_and_cantools_need() -> None:
     done = echelon("dbc", "lab")
     database = cantools.database.load_string(done.stdout, "dbc")

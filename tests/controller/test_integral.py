@@ -10,12 +10,13 @@ from scipy.optimize import brentq, root
 
 from echelon.controller.laws import Block, Integral
 from echelon.controller.laws.central import CentralLaw
-from echelon.controller.laws.law import law_block
-from echelon.controller.prediction.sampled import delay_margin, largest_stable_delay, linear_gains, spectral_radius
+from echelon.controller.laws.law import LinearGains, law_block
+from echelon.controller.prediction.block_margin import delay_margin
+from echelon.controller.prediction.gains import linear_gains
 from echelon.plan.plan import Array, Plan
 from echelon.sim.parts.loading import REGISTRY, load
 from echelon.sim.results.block_series import block_series
-from support.growth import growth, single
+from support.growth import growth, largest_delay_of, radius_of, single
 from support.runs import SCENARIOS, trace_of
 from support.runs import plan_of as shipped
 from support.trees import PAPER_TREE, plan_of, random_epsilon, scenario, with_random_gains
@@ -144,7 +145,7 @@ def test_runs_grow_and_decay_as_the_spectral_radius_says(k1, k2, k_i, lead):
     found = []
     for T in (0.05, 0.2, 0.6, 0.9, 1.3, 2.0, 2.6):
         plan = alone(T, k1, k2, k_i, lead=lead)
-        radius = spectral_radius(plan)
+        radius = radius_of(plan)
         norms = np.linalg.norm(pushed(plan, np.zeros(2), int(min(20_000, max(64, 20 / abs(np.log(radius)))))), axis=1)
         assert growth(norms) == pytest.approx(np.log(radius), rel=0.15, abs=1e-3)
         found.append(radius < 1)
@@ -154,7 +155,7 @@ def test_runs_grow_and_decay_as_the_spectral_radius_says(k1, k2, k_i, lead):
 
 def test_boundary_in_k_i_is_that_of_routh_and_hurwitz_as_the_period_falls():
     for T, precision in ((0.1, 0.2), (0.01, 0.02), (0.001, 0.002)):
-        boundary = brentq(lambda k_i, T=T: spectral_radius(alone(T, 1.0, 1.2, k_i)) - 1, 0.1, 3.0)
+        boundary = brentq(lambda k_i, T=T: radius_of(alone(T, 1.0, 1.2, k_i)) - 1, 0.1, 3.0)
         assert boundary == pytest.approx(1.2, rel=precision)
 
 
@@ -187,12 +188,18 @@ def test_map_is_the_loop_itself_pushed_by_unit_vectors(delay_ticks):
     size = 2 * n * (delay_ticks + 1) + n
     whole = np.array([tick(unit) for unit in np.eye(size)]).T
     expected = np.abs(np.linalg.eigvals(whole)).max()
-    assert spectral_radius(plan, delay_ticks) == pytest.approx(expected, rel=1e-6)
+    assert radius_of(plan, delay_ticks) == pytest.approx(expected, rel=1e-6)
+
+
+def numbers(*of_e_rate_and_integral: float) -> LinearGains:
+    """Returns gains that are numbers."""
+    return LinearGains(*(np.array([[gain]]) for gain in of_e_rate_and_integral), np.eye(1))
 
 
 @pytest.mark.parametrize(("k1", "k2", "k_i"), [(1.0, 1.2, 0.4), (0.5, 1.0, 0.1), (2.0, 1.0, 1.9), (0.3, 2.0, 0.5)])
 def test_margin_puts_a_root_on_the_axis_and_is_where_the_sampled_boundary_tends_to(k1, k2, k_i):
-    tau = delay_margin(k1, k2, k_i)
+    tau = delay_margin(numbers(k1, k2, k_i))
+    assert tau is not None
     axis = 1j * np.geomspace(1e-3, 1e3, 200_001)
 
     def least(delay: float) -> float:
@@ -201,10 +208,10 @@ def test_margin_puts_a_root_on_the_axis_and_is_where_the_sampled_boundary_tends_
     assert least(tau) < 1e-4
     assert min(least(share * tau) for share in (0.0, 0.3, 0.6, 0.9)) > 1e-3
     T = round(tau / 40, 6)
-    found = largest_stable_delay(alone(T, k1, k2, k_i))
+    found = largest_delay_of(alone(T, k1, k2, k_i))
     assert found is not None
     assert abs((found + 0.5) * T - tau) < 1.1 * T
-    assert delay_margin(k1, k2, k1 * k2) == 0
+    assert delay_margin(numbers(k1, k2, k1 * k2 * 1.001)) is None
 
 
 def steady(name: str, *overrides: str) -> dict[str, Array]:

@@ -361,7 +361,7 @@ def test_an_error_shows_a_limited_number_of_lines():
 
 def test_an_error_about_a_default_calls_it_a_default():
     assert said(BASE.replace("[law]\nepsilon = [0.1]", "")) == (
-        "t.toml: law.epsilon = [0.1, 0.1], its default (the scenario gives none): must have 1 number with "
+        "t.toml: law.epsilon = [0.7, 0.7], its default (the scenario gives none): must have 1 number with "
         "time_scales = 'three', as many as layers of the tree"
     )
     huge = said(BASE.replace("epsilon = [0.1]", "epsilon = [1e-200]"))

@@ -8,7 +8,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from echelon.controller.laws.central import CentralLaw
-from echelon.controller.prediction.sampled import spectral_radius
 from echelon.messages import STATE_FIELDS
 from echelon.plan.plan import Array, Plan
 from echelon.sim.engines.in_process import Engine
@@ -16,6 +15,7 @@ from echelon.sim.parts.loading import load
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances
 from echelon.sim.results.trace import Trace, TraceBuilder
+from support.growth import radius_of
 from support.synthetic import PAPER, claims_of
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
@@ -157,7 +157,7 @@ def test_six_milliseconds_of_delay_settle_and_seven_do_not():
     unsettled = run(["duration=1.2", "avoidance.enabled=false", late(0.007)])
     peaks = intra_peaks(unsettled)
     assert not np.isfinite(peaks[-1])
-    pace = spectral_radius(unsettled.plan, 7) ** 50
+    pace = radius_of(unsettled.plan) ** 50
     assert pace > 1
     np.testing.assert_allclose(peaks[3:10] / peaks[2:9], pace, rtol=0.02)
 

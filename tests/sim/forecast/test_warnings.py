@@ -82,7 +82,7 @@ def test_what_a_rounded_delay_is_said_to_act_as_is_what_the_run_does() -> None:
         trace_of(plan_of("lab", *short, f'links=[{{channel="state", delay={delay}}}]')) for delay in (0.004, 0.01)
     )
     assert rounded.digest() == whole.digest()
-    assert warnings(whole.plan) == ()
+    assert not [line for line in warnings(whole.plan) if "acts as" in line]
 
 
 def test_on_the_closed_path_commands_are_used_at_torque_periods() -> None:

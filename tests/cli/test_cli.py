@@ -28,12 +28,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_leaves_its_folder(folder: Path) -> None:
-    names = {".echelon.json", "scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html"}
+    names = {
+        ".echelon.json",
+        "scenario.toml",
+        "run.json",
+        "run.mcap",
+        "can.log",
+        "torque.dbc",
+        "summary.json",
+        "report.html",
+    }
     assert {file.name for file in folder.iterdir()} == names
     plan = plan_of("paper", "duration=0.2")
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["trace_digest"] == trace_of(plan).digest() == read_trace(folder / "run.mcap", plan).digest()
-    assert summary["verdict"] == {"holds": True, "reasons": []}
+    assert summary["verdict"]["word"] == "HEALTHY"
     assert summary["can"]["frames"] == 9 * 200
     assert read_scenario(folder / "run.mcap") == (folder / "scenario.toml").read_text()
     assert read_metadata(folder / "run.mcap")["engine"] == "inprocess"
@@ -161,7 +170,7 @@ def test_a_bus_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert len(done.stderr.splitlines()) == 1
     assert "bridge cannot start: cannot open CAN bus socketcan:lo" in done.stderr
-    assert not json.loads(done.stdout)["verdict"]["holds"]
+    assert json.loads(done.stdout)["verdict"]["word"] == "FAILS"
 
 
 def test_a_default_folder_that_cannot_be_made_is_named() -> None:

@@ -15,9 +15,9 @@ from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances
-from echelon.sim.results.measures import claim_results
+from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace, TraceBuilder
-from support.synthetic import PAPER
+from support.synthetic import PAPER, run_facts
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 UNTIL = 2.0
@@ -101,10 +101,10 @@ def test_without_lead_the_hold_costs_what_its_period_is(reference):
 
 
 def test_claims_of_the_paper_hold(paper):
-    rows = {row.block: row for row in claim_results(paper.plan, block_series(paper))}
+    rows = {row.block: row for row in summarise(paper, [], None, run_facts()).claims}
     assert [row.block for row in rows.values()] == ["intra", "inter", "centroid"]
     for row, about in zip(rows.values(), (0.1, 1.0, 10.0), strict=True):
-        assert row.holds
+        assert row.outcome == "passed"
         assert about / 3 < row.measured <= about
 
 
@@ -129,8 +129,8 @@ def test_avoidance_keeps_robots_apart_where_they_would_meet(paper):
     assert kept.closest is not None
     assert kept.closest.distance > radius
     assert kept.violations == ()
-    for row in claim_results(apart.plan, block_series(apart)):
-        assert row.holds
+    for row in summarise(apart, [], None, run_facts()).claims:
+        assert row.outcome == "passed"
 
 
 def test_one_seed_is_one_run_and_another_is_not():

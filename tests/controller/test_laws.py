@@ -16,7 +16,6 @@ from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.plugins import Part
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load, parse
-from echelon.sim.results.block_series import block_series
 from echelon.sim.results.summary import summarise
 from support.runs import SCENARIOS, plan_of, trace_of
 from support.synthetic import run_facts
@@ -289,8 +288,8 @@ def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
 
 def test_what_sliding_claims_takes_the_linear_law_nine_times_as_long() -> None:
     plan = plan_of("lab", "claims=[{block='intra',settled_by=1.0,band=1e-4},{block='inter',settled_by=1.0,band=1e-4}]")
-    intra, inter = (claim.measured for claim in claim_results(plan, block_series(trace_of(plan))))
+    intra, inter = (claim.measured for claim in summarise(trace_of(plan), [], None, run_facts()).claims)
     plan = plan_of("sliding")
-    quick = [claim.measured for claim in claim_results(plan, block_series(trace_of(plan)))]
+    quick = [claim.measured for claim in summarise(trace_of(plan), [], None, run_facts()).claims]
     assert intra > 8.5 * quick[0]
     assert inter > 8.5 * quick[1]

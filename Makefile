@@ -7,7 +7,8 @@ BIN := $(VENV)/bin
 # The quick part of the tests: rooms without input and output, and those that lean on a dependency.  No vcan, no wall clock,
 # nothing marked `slow`.
 QUICK := -m "not slow" tests/planning tests/plan tests/controller tests/agents tests/runtime \
-  tests/bridge/protocols tests/bridge/timing tests/bridge/can tests/sim/results tests/sim/recording tests/sim/report
+  tests/bridge/protocols tests/bridge/timing tests/bridge/can tests/sim/results tests/sim/recording tests/sim/report \
+  $(addprefix tests/cli/test_cli_help.py::, test_bash_knows_all_commands_and_all_options test_scripts_of_other_shells_know_the_commands)
 
 .PHONY: help setup demo docs test test-quick test-lowest test-newest lint bench lock clean
 help: ## what can be made

@@ -9,12 +9,9 @@ closed, wall clock      WallBridge      a ClosedBridge                robots' to
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from pathlib import Path
 
 from echelon.bridge.reports import BridgeProgress, CanReport
-from echelon.bridge.roles.commander import Commander
 from echelon.messages import Message
-from echelon.plan.plan import Plan
 
 
 class Bridge(ABC):
@@ -66,19 +63,3 @@ class NoBridge(Bridge):
 
     def report(self) -> None:
         return None
-
-
-def open_bridge(plan: Plan, urls: Sequence[str], folder: Path, commander: Commander | None = None) -> Bridge:
-    """Returns the bridge of a run in one process.
-
-    On the closed path `commander` is the bridge's role.  The virtual drives get its frames directly; the buses only show them.
-    Raises ValueError or OSError if a bus or a file cannot be opened."""
-    if commander is not None:
-        from echelon.bridge.stations.closed import ClosedBridge
-
-        return ClosedBridge(plan, urls, folder, paired=False, role=commander)
-    if urls:
-        from echelon.bridge.stations.mirror import MirrorBridge
-
-        return MirrorBridge(plan, urls, folder)
-    return NoBridge()

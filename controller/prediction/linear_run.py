@@ -27,6 +27,7 @@ from scipy.sparse import coo_array, csr_array
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, powers_of
 from echelon.messages import Channel
+from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, LinkPlan, Plan
 
 CHANNELS: Final = (Channel.STATE, Channel.GROUP_STATE, Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
@@ -84,7 +85,7 @@ class LinearRun:
         timeout when they would be used."""
         if found := untreated(plan):
             raise PredictionError(f"{len(found)} of {len(plan.links)} links lose messages or have delays that vary")
-        self.plan = plan = replace(plan, avoidance=replace(plan.avoidance, enabled=False))
+        self.plan = plan = with_message_sizes(replace(plan, avoidance=replace(plan.avoidance, enabled=False)))
         self.hyperperiod_ns = plan.root.period_ns
         robots = [LinearRobot(plan, robot) for robot in plan.robots]
         nodes = [LinearNode(plan, node) for node in plan.nodes]

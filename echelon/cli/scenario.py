@@ -106,7 +106,7 @@ def validate(options: ValidateOptions) -> int:
         "ticks": plan.duration_ns // plan.robots[0].period_ns,
         "time_scales": {block.name: block.sigma for block in plan.blocks},
         "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
-        "warnings": list(warnings(plan)),
+        "warnings": warnings(plan),
     }
     code = 2 if options.strict and facts["warnings"] else 0
     if options.json:

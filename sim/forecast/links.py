@@ -26,8 +26,13 @@ def _counted(plan: Plan, what: Callable[[Plan, LinkPlan], str | None]) -> list[s
 
 
 def _silence(plan: Plan, link: LinkPlan) -> str | None:
-    """Returns why nothing is ever used of what arrives over a link, if so; `beforehand` names links over which nothing does."""
-    acts_ns = ticks_up(link.delay_min_ns, tick_of(plan, link))
+    """Returns why nothing is ever used of what is sent over a link, if so."""
+    tick_ns, duration_ns = tick_of(plan, link), plan.duration_ns
+    if link.loss == 1:
+        return "loss = 1: nothing arrives"
+    if link.delay_min_ns > duration_ns:
+        return f"a delay of {link.delay_min_ns / 1e9:g} s in a run of {duration_ns / 1e9:g} s: nothing arrives"
+    acts_ns = ticks_up(link.delay_min_ns, tick_ns)
     if acts_ns > link.timeout_ns:
         return (
             f"what arrives is {acts_ns / 1e9:g} s old, more than the timeout of {link.timeout_ns / 1e9:g} s: "

@@ -6,14 +6,14 @@ from echelon.plan.plan import Plan
 from echelon.sim.forecast.links import link_warnings
 from echelon.sim.forecast.motion import motion_warnings
 from echelon.sim.forecast.sampling import sampling_warnings
-from echelon.sim.results.beforehand import beforehand
+from echelon.sim.forecast.verdict import verdict_warnings
 
 
 def warnings(plan: Plan) -> tuple[str, ...]:
     """Returns a line for each thing that is hardly meant; none if there is nothing to say."""
     return (
         *_heading_warnings(plan),
-        *beforehand(plan),
+        *verdict_warnings(plan),
         *link_warnings(plan),
         *sampling_warnings(plan),
         *motion_warnings(plan),

@@ -88,7 +88,7 @@ def _whole(evidence: Evidence) -> Iterator[CheckResult]:
 
     at = "before it began" if end_s is None else f"at {end_s:g} s of {wanted_s:g} s"
     if run.failure:
-        yield told("failed", f"{at}: {run.failure.splitlines()[0]}")
+        yield told("failed", f"{run.failure.splitlines()[0]} ({at})")
         return
     if run.stopped:
         yield told("failed", f"the run was stopped {at}")

@@ -143,7 +143,7 @@ def test_a_new_scenario_is_tame_and_holds(groups: str, drive: str | None) -> Non
     )
     assert all(fit.fits for fit in plan_fit(plan))
     summary = verdict(text)
-    assert summary.verdict.word == "HOLDS"
+    assert summary.verdict.word == "HOLDS", summary.verdict
     assert summary.claims
     assert all(row.saturation_share == 0 for row in summary.torque)
 
@@ -176,7 +176,7 @@ def test_what_is_new_runs_as_processes(tmp_path: Path) -> None:
     done = echelon("run", "my.toml", "--quiet", "--no-report", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads(done.stdout)
-    assert (summary["can"]["referee"]["kinds"], summary["verdict"]["holds"]) == ({}, True)
+    assert (summary["can"]["referee"]["kinds"], summary["verdict"]["word"]) == ({}, "HOLDS")
 
 
 # What their keys are

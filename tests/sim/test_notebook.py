@@ -73,7 +73,7 @@ def test_what_is_not_there_is_named(lab: echelon.Run) -> None:
 
 
 def test_the_summary_is_in_the_attributes(lab: echelon.Run) -> None:
-    assert (lab.verdict.word, lab.holds) == ("HEALTHY", False)
+    assert (lab.verdict.word, lab.holds) == ("HEALTHY", False)  # it claims nothing
     assert lab.failure is None
     assert (lab.scenario, lab.duration, lab.claims) == ("lab", 0.5, ())
     assert lab.distance.smallest > 0

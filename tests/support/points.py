@@ -10,6 +10,7 @@ import pytest
 import echelon.sim.engines.in_process
 from echelon.controller.trajectory import Line
 from echelon.messages import STATE_FIELDS, Channel, Heard, Message
+from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, Plan
 from echelon.plugins import Part
 from echelon.role import Input, Stage
@@ -49,7 +50,9 @@ def at_rest(plan: Plan) -> Plan:
         for node in plan.nodes
     )
     rest = Part("line", {}, None, Line(velocity=(0.0, 0.0)))
-    return replace(plan, nodes=nodes, trajectory=rest, avoidance=replace(plan.avoidance, enabled=False))
+    return with_message_sizes(
+        replace(plan, nodes=nodes, trajectory=rest, avoidance=replace(plan.avoidance, enabled=False))
+    )
 
 
 def point_run(plan: Plan, hyperperiods: int, patch: pytest.MonkeyPatch) -> Array:

@@ -122,3 +122,8 @@ def kill_session(session: int) -> None:
             os.kill(pid, signal.SIGKILL)
         except ProcessLookupError:
             pass
+
+
+def reasons(summary: dict[str, Any]) -> list[str]:
+    """Returns the sentences of all checks of a summary.json that failed."""
+    return [check["text"] for check in summary["verdict"]["checks"] if check["outcome"] == "failed"]

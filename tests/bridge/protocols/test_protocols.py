@@ -183,6 +183,7 @@ def test_a_process_that_gets_a_plan_imports_no_more_of_protocols_than_their_clas
     assert not modules & {"cantools", "can", "zenoh"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("uses", [*permutations(PROTOCOLS)][::2])
 def test_all_protocols_on_one_bus_by_default(uses: tuple[str, ...], tmp_path: Path) -> None:
     """Nine robots on the closed path: the referee finds nothing, and the DBC describes every frame."""

@@ -13,7 +13,9 @@ from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.forecast.motion import asked_of, torque_loop_diverges, torque_loop_numbers
 from echelon.sim.forecast.warnings import warnings
+from echelon.sim.results.summary import summarise
 from support.runs import plan_of, trace_of
+from support.synthetic import run_facts
 
 FREE = ("robot.torque_limit=inf", "robot.torque_rate_limit=inf", "robot.wheel_speed_limit=inf")
 
@@ -37,10 +39,23 @@ def test_a_heading_that_looks_like_degrees() -> None:
 
 
 def test_a_claim_beyond_the_end() -> None:
-    assert only(plan_of("lab", "duration=19.0")) == (
-        "claim: centroid by 20 s cannot be tested, for the run ends at 19 s; a claim that is not tested fails"
-    )
+    ends = "the run ends before, at 19 s; a claim that is not tested fails"
+    assert only(plan_of("lab", "duration=19.0")) == f"claims.2.settled_by = 20: {ends}"
     assert warnings(plan_of("lab", "duration=20.0")) == ()
+
+
+def test_a_dwell_time_beyond_the_end() -> None:
+    said = only(plan_of("lab", "claims=[{block='g1', settled_by=5.0, dwell=200.0}]"))
+    assert said == "claims.0: cannot be tested, its dwell time is 50 s and the run ends at 40 s"
+
+
+def test_a_run_that_is_too_short_for_health_checks() -> None:
+    said = only(plan_of("lab", "duration=17.9", "claims=[]"))
+    assert said == "duration = 17.9: too short to tell growth of centroid; 18 s is enough"
+    checks = summarise(trace_of(plan_of("lab", "duration=17.9", "claims=[]")), [], None, run_facts()).verdict.checks
+    growth = [check for check in checks if check.name == "growth" and check.outcome == "not tested"]
+    assert [check.about for check in growth] == [("centroid",)]  # and so it is
+    assert warnings(plan_of("lab", "duration=18.0", "claims=[]")) == ()
 
 
 @pytest.mark.parametrize(
@@ -51,6 +66,8 @@ def test_a_claim_beyond_the_end() -> None:
         ('{channel="reference", delay={min=0.0, max=0.01}}', "reference (3 links): delays from 0 to 0.01 s all act as 0.01 s"),
         ('{channel="command", delay={min=0.01, max=0.035}}',
          "command (9 links): delays from 0.01 to 0.035 s act as 0.02 to 0.04 s"),
+        ('{channel="command", delay=41.0}', "command (9 links): a delay of 41 s in a run of 40 s: nothing arrives"),
+        ('{channel="group_state", loss=1.0}', "group_state (3 links): loss = 1: nothing arrives"),
         ('{channel="state", delay=0.2, policy="hold_then_stop", timeout=0.1}',
          "state (9 links): what arrives is 0.2 s old, more than the timeout of 0.1 s: nothing is used"),
     ],
@@ -59,19 +76,13 @@ def test_links_that_do_something_else_than_they_seem_to(rule: str, says: str) ->
     assert only(plan_of("lab", f"links=[{rule}]")).startswith(f"links: {says}")
 
 
-@pytest.mark.parametrize("rule", ['{channel="state", delay=41.0}', '{channel="state", loss=1.0}'])
-def test_links_over_which_nothing_arrives(rule: str) -> None:
-    found = warnings(plan_of("lab", f"links=[{rule}]"))
-    assert any(line.startswith("messages: nothing can arrive over 9 of 24 links") for line in found)
-
-
 def test_what_a_rounded_delay_is_said_to_act_as_is_what_the_run_does() -> None:
     short = ("duration=1.0", "claims=[]")
     rounded, whole = (
         trace_of(plan_of("lab", *short, f'links=[{{channel="state", delay={delay}}}]')) for delay in (0.004, 0.01)
     )
     assert rounded.digest() == whole.digest()
-    assert not any("acts as" in line for line in warnings(whole.plan))
+    assert not [line for line in warnings(whole.plan) if "acts as" in line]
 
 
 def test_on_the_closed_path_commands_are_used_at_torque_periods() -> None:

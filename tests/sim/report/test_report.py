@@ -114,6 +114,7 @@ def test_the_page_needs_nothing_but_itself(single):
             assert "//" not in value
 
 
+@pytest.mark.slow
 def test_ids_are_unique_or_repeat_the_same_thing(both):
     ids = {value for _, key, value in both.attributes if key == "id"}
     used = {value[1:] for _, key, value in both.attributes if key.endswith("href")}

@@ -268,7 +268,7 @@ def test_where_nothing_was_ever_used_no_age_is_told():
 @pytest.mark.parametrize(
     ("facts", "text"),
     [
-        ({"failure": "interrupted"}, "whole: at 14.99 s of 20 s: interrupted"),
+        ({"failure": "interrupted"}, "whole: interrupted (at 14.99 s of 20 s)"),
         ({"stopped": "the state of g1/r1 is not finite from 15 s on"}, "whole: the run was stopped at 14.99 s of 20 s"),
     ],
 )

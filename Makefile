@@ -3,11 +3,16 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-LOCKS := requirements.lock requirements-dev.lock requirements-bench.lock
 
-.PHONY: help setup demo docs test lint bench lock clean
+# The quick part of the tests: rooms without input and output, and those that lean on a dependency.  No vcan, no wall clock,
+# nothing marked `slow`.
+QUICK := -m "not slow" tests/planning tests/plan tests/controller tests/agents tests/runtime \
+  tests/bridge/protocols tests/bridge/timing tests/bridge/can tests/sim/results tests/sim/recording tests/sim/report \
+  $(addprefix tests/cli/test_cli_help.py::, test_bash_knows_all_commands_and_all_options test_scripts_of_other_shells_know_the_commands)
+
+.PHONY: help setup demo docs test test-quick test-lowest test-newest lint bench lock clean
 help: ## what can be made
-	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
 $(VENV)/.made:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -44,6 +49,44 @@ docs: $(VENV)/.run ## docs/scenario.md, summary.schema.json and public-names.md,
 test: $(VENV)/.dev ## all tests
 	$(BIN)/python -m pytest $(ARGS)
 
+test-quick: $(VENV)/.dev ## the quick part of the tests
+	$(BIN)/python -m pytest $(QUICK) $(ARGS)
+
+# Environments for other versions.  uv makes them, since it takes seconds where pip takes minutes.
+$(VENV)-lowest/.made: requirements-lowest.lock pyproject.toml $(VENV)/.dev
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)-lowest
+	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --require-hashes -r requirements-lowest.lock
+	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --no-deps --editable .
+	@touch $@
+
+test-lowest: $(VENV)-lowest/.made ## the quick part with the lowest versions of all dependencies, in .venv-lowest
+	$(VENV)-lowest/bin/python -m pytest $(QUICK) $(ARGS)
+
+# The newest Python on this machine: of each python3.N on PATH and in pyenv the version and the place, the last counts.
+NEWEST = $(shell (IFS=:; for folder in $$PATH; do ls "$$folder"/python3.*; done; ls "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/*/bin/python3.*) \
+  2>/dev/null | grep -E '/python3[.][0-9]+$$' | while read -r python; do \
+  "$$python" -c 'import sys, venv; v = sys.version_info; v.releaselevel == "final" and print("%d.%d.%d" % v[:3], sys.executable)'; \
+  done 2>/dev/null | sort -V | tail -n 1)
+DIGEST = import json, sys; print(json.load(open(sys.argv[1] + "/summary.json"))["trace_digest"])
+
+test-newest: $(VENV)/.dev ## the quick part with the newest Python of this machine, in .venv-newest; `lab` must give the same digest
+	@set -e; newest="$(NEWEST)"; version=$${newest%% *}; python=$${newest#* }; \
+	own=$$($(BIN)/python -c 'import platform; print(platform.python_version())'); \
+	[ "$${version%.*}" != "$${own%.*}" ] && [ "$$(printf '%s\n' "$$own" "$$version" | sort -V | tail -n 1)" = "$$version" ] || \
+	  { echo "test-newest needs a Python newer than the $$own of $(VENV): on PATH or in pyenv the newest is $${version:-none}; or name one: make test-newest NEWEST='3.14.0 /path/to/python3.14'" >&2; exit 1; }; \
+	echo "newest Python: $$version, $$python"; \
+	$(BIN)/uv venv --quiet --clear --python "$$python" $(VENV)-newest; \
+	$(BIN)/uv pip install --quiet --python $(VENV)-newest --require-hashes -r requirements-dev.lock; \
+	$(BIN)/uv pip install --quiet --python $(VENV)-newest --no-deps --editable .
+	$(VENV)-newest/bin/python -m pytest $(QUICK) $(ARGS)
+	@set -e; folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
+	for venv in $(VENV) $(VENV)-newest; do \
+	  $$venv/bin/echelon run lab --quiet --no-report --out "$$folder/$$venv" >/dev/null; \
+	  digest=$$($$venv/bin/python -c '$(DIGEST)' "$$folder/$$venv"); \
+	  echo "lab, $$($$venv/bin/python -V): $$digest"; \
+	  [ "$${first:=$$digest}" = "$$digest" ] || { echo "test-newest: the digests of lab differ" >&2; exit 1; }; \
+	done
+
 lint: $(VENV)/.dev ## ruff, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -57,7 +100,8 @@ lock: $(VENV)/.dev ## resolve the dependencies anew
 	$(BIN)/uv pip compile $(LOCK) pyproject.toml -o requirements.lock
 	$(BIN)/uv pip compile $(LOCK) pyproject.toml --group dev -o requirements-dev.lock
 	$(BIN)/uv pip compile $(LOCK) pyproject.toml --group dev --group bench -o requirements-bench.lock
+	$(BIN)/uv pip compile $(LOCK) --resolution lowest-direct pyproject.toml --group test -o requirements-lowest.lock
 LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --upgrade
 
-clean: ## forget .venv and what tools cached
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+clean: ## forget .venv, its relatives and what tools cached
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -35,11 +35,11 @@ class Robot:
         self._limited = any(
             limit != float("inf") for limit in (robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit)
         )
-        self._inner = robot.period_ns // robot.torque_period_ns
+        self._torque_periods = robot.period_ns // robot.torque_period_ns
         self._h = robot.torque_period_ns * 1e-9
-        self._mine = acceleration_of(robot)
+        self._acceleration = acceleration_of(robot)
         self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
-        self._did = (0.0,) * 9
+        self._period_values = (0.0,) * 9
         self.stages: tuple[Stage, ...] = (
             Stage(Turn.SAY, robot.period_ns, (), self._say),
             Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
@@ -49,7 +49,7 @@ class Robot:
         """Returns the STATE message at `time_ns`."""
         x, y, theta, v, omega, c, s = self.state
         across = self._plan.offset * omega
-        values = np.array((x, y, v * c - across * s, v * s + across * c, theta, v, omega, *self._did))
+        values = np.array((x, y, v * c - across * s, v * s + across * c, theta, v, omega, *self._period_values))
         return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
 
     def _move(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
@@ -59,12 +59,12 @@ class Robot:
         if command is None:
             ax = ay = 0.0
         else:
-            ax, ay = command.values[self._mine].tolist()
+            ax, ay = command.values[self._acceleration].tolist()
         try:
             self._advance(ax, ay, command is not None)
         except (ValueError, OverflowError):  # the run diverged: angles and speeds overflow
             self.state = LOST
-            self._did = (ax, ay, nan, nan, nan, nan, nan, nan, 0.0)
+            self._period_values = (ax, ay, nan, nan, nan, nan, nan, nan, 0.0)
         return ()
 
     def _advance(self, ax: float, ay: float, commanded: bool) -> None:
@@ -73,7 +73,7 @@ class Robot:
         right_sum = left_sum = right_square = left_square = right_peak = left_peak = 0.0
         saturated = 0
         right = left = 0.0
-        for _ in range(self._inner):
+        for _ in range(self._torque_periods):
             if commanded:
                 right, left = inverse(state, ax, ay, 0.5 * h)
             if self._limited:
@@ -87,8 +87,8 @@ class Robot:
             right_peak = max(right_peak, abs(right))
             left_peak = max(left_peak, abs(left))
         self.state = state
-        n = self._inner
-        self._did = (
+        n = self._torque_periods
+        self._period_values = (
             ax, ay, right_sum / n, left_sum / n, right_square / n, left_square / n, right_peak, left_peak, float(saturated),
         )  # fmt: skip
 
@@ -105,7 +105,7 @@ class RobotOnBus(Robot):
         robot = plan.robots[index]
         self._torques: list[tuple[float, float]] = []
         self._limited_count = 0
-        self._heard = (0.0, 0.0)
+        self._commanded = (0.0, 0.0)
         assert plan.bridge is not None
         h_ns = robot.torque_period_ns
         self.stages = (
@@ -134,8 +134,8 @@ class RobotOnBus(Robot):
         """Sums up the torques of the period that ends, for the next STATE message."""
         right, left = zip(*self._torques, strict=True)
         n = len(self._torques)
-        self._did = (
-            *self._heard,
+        self._period_values = (
+            *self._commanded,
             sum(right) / n,
             sum(left) / n,
             sum(tau * tau for tau in right) / n,
@@ -153,10 +153,10 @@ class RobotOnBus(Robot):
         right = left = 0.0
         limited = False
         if command is None:
-            self._heard = (0.0, 0.0)
+            self._commanded = (0.0, 0.0)
             self._limits.tau_right = self._limits.tau_left = 0.0
         else:
-            ax, ay = self._heard = command.values[self._mine].tolist()
+            ax, ay = self._commanded = command.values[self._acceleration].tolist()
             try:
                 right, left = self._inverse(state, ax, ay, 0.5 * self._h)
             except (ValueError, OverflowError):

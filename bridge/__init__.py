@@ -1,1 +1,1 @@
-"""CAN: frames, buses, their load, and the bridge that puts wheel torques on the bus."""
+"""The CAN side: buses, drive protocols, the bridge that puts wheel torques on a bus, and the referee."""

@@ -1,7 +1,11 @@
-"""CAN frames as values of a message (channel FRAMES): the time rail of a bus in virtual time, and what recorders get.
+"""CAN frames as the values of a message on the channel FRAMES (docs/architecture.md, 3.1 and 5.2).
 
-Three 64-bit words per frame, whose bits travel as float64: the instant [ns]; identifier (bits 0 to 10), remote (11),
-number of data bytes (12 to 15), bus (16 to 23) and node (from 24 on); the data bytes.
+A frame takes three 64-bit words, whose bits travel as float64:
+
+word    content
+0       instant [ns]
+1       bits 0 to 10 identifier, 11 remote, 12 to 15 number of data bytes, 16 to 23 bus, from 24 on node
+2       data bytes
 """
 
 from collections.abc import Iterable
@@ -13,19 +17,20 @@ from echelon.bridge.protocols.frame import Frame
 from echelon.messages import Message, Values
 
 BRIDGE_NODE: Final = 0
-"""The bridge's number among the nodes of a bus; drives have those from 1 on."""
+"""The node number of the bridge; drives have the numbers from 1 on"""
 NO_BUS: Final = 255
-"""Stands for the bus in what the bridge tells drives besides frames: `OFF`, `EMPTIED` or `BACK` of a node."""
+"""The bus number of a mark: not a frame, but news of a node's controller, which the bridge sends to the drives.  Marks are
+`OFF`, `EMPTIED` and `BACK`."""
 OFF: Final = Frame(0)
-"""The node's controller is off its bus from now on: it hears nothing."""
+"""Mark: the node is bus-off from now on and hears nothing"""
 EMPTIED: Final = Frame(1)
-"""It is still off, and what waited in its queue is lost."""
+"""Mark: the node is still bus-off; the frames in its queue are lost"""
 BACK: Final = Frame(2)
-"""It is on its bus again."""
+"""Mark: the node is on its bus again"""
 
 
 class TimedFrame(NamedTuple):
-    """A frame, its instant in run time, which of the plan's buses it is on, and which node sent it."""
+    """A frame with its instant in run time, the number of its bus in the plan, and the node that sent it."""
 
     time_ns: int
     bus: int
@@ -36,7 +41,7 @@ class TimedFrame(NamedTuple):
 def add_words(
     words: list[int], time_ns: int, bus: int, node: int, can_id: int, data: bytes, remote: bool = False
 ) -> None:
-    """Adds a frame's three words."""
+    """Appends the three words of a frame to `words`."""
     words += (
         time_ns & 0xFFFF_FFFF_FFFF_FFFF,
         can_id | remote << 11 | len(data) << 12 | bus << 16 | node << 24,
@@ -45,7 +50,7 @@ def add_words(
 
 
 def pack(frames: Iterable[TimedFrame]) -> Values:
-    """Returns the values of a message."""
+    """Returns the values of a message with these frames."""
     words: list[int] = []
     for time_ns, bus, node, (can_id, data, remote) in frames:
         add_words(words, time_ns, bus, node, can_id, data, remote)
@@ -53,12 +58,14 @@ def pack(frames: Iterable[TimedFrame]) -> Values:
 
 
 def frames_of(message: Message) -> list[TimedFrame]:
-    """Returns the frames in a message, without what the bridge tells besides."""
+    """Returns the frames in a message, without the marks."""
     return [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
 
 
 def unpack(values: Values) -> list[TimedFrame]:
-    """Inverse of `pack`; of bytes from outside what is left over is dropped, and a length above eight is eight."""
+    """Returns the frames and marks in the values of a message: the inverse of `pack`.
+
+    Never raises: an incomplete frame at the end is dropped, and a length above eight counts as eight."""
     words = np.ascontiguousarray(values[: len(values) - len(values) % 3])
     frames = []
     for time_ns, (_, head, data) in zip(

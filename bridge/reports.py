@@ -1,6 +1,6 @@
-"""What bridge, drives, buses and referee report of a run: frozen records, the same for every way of the torques.
+"""The reports of bridge, drives, buses and referee about a run: frozen records, the same on the mirrored and the closed path.
 
-`echelon.sim.results` renders them as JSON in `summary.json`.  Times are in seconds of run time.
+`echelon.sim.results` writes them into `summary.json`.  Times are seconds of run time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 EVENTS: Final = 1000
-"""Events kept of a bus"""
+"""How many events of a bus a report keeps"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,25 +16,26 @@ class IdentifierReport:
     """The frames with one identifier on one bus."""
 
     frames: int
-    """Carried by the bus"""
+    """Frames that the bus carried"""
     lost: int
-    """Lost: no room in a queue, a controller off its bus, or too old to be sent"""
+    """Frames that were lost: the queue was full, the controller was bus-off, or the frame was too old to be sent"""
     destroyed: int
-    """Attempts that an error destroyed; each was sent again"""
+    """Attempts to send that an error destroyed; each was repeated"""
     latency_mean: float
-    """From the queue to the end of the frame [s]"""
+    """Mean time from the queue to the end of the frame [s]"""
     latency_max: float
+    """Largest time from the queue to the end of the frame [s]"""
     latency_bound: float | None
-    """Worst case by response-time analysis of the cyclic frames, without errors [s]; None: none is known"""
+    """Worst case by the response-time analysis of the cyclic frames, without errors [s]; None: not known"""
 
     def plus(self, other: "IdentifierReport") -> "IdentifierReport":
-        """Returns the report with what another part of the run lost of the same frames."""
+        """Returns this report with the losses of `other`, the report of another process on the same frames, added."""
         return replace(self, lost=self.lost + other.lost)
 
 
 @dataclass(frozen=True, slots=True)
 class BusEvent:
-    """Something that happened to a node of a bus, e.g. `bus-off`."""
+    """An event at a node of a bus, for example `bus-off`; `who` names the node."""
 
     time: float
     node: int
@@ -49,7 +50,7 @@ class BusReport:
     name: str
     bitrate: int
     load: float
-    """Share of the time that its frames took, or would take on a real bus"""
+    """Share of the time that the frames took, or would take on a real bus: 1 is a full bus"""
     lost: int = 0
     destroyed: int = 0
     events: tuple[BusEvent, ...] = ()
@@ -57,8 +58,8 @@ class BusReport:
     """By identifier, three hexadecimal digits"""
 
     def plus(self, other: "BusReport") -> "BusReport":
-        """Returns the report with what another part of the run knows of the same bus: its identifiers, what it lost, what
-        happened to its nodes."""
+        """Returns this report with the losses, events and identifiers of `other` added: the report of another process on the
+        same bus."""
         identifiers = dict(self.identifiers)
         for can_id, more in other.identifiers.items():
             identifiers[can_id] = identifiers[can_id].plus(more) if can_id in identifiers else more
@@ -73,25 +74,25 @@ class BusReport:
 
 @dataclass(frozen=True, slots=True)
 class ScheduledEvent:
-    """An event of the scenario, for people."""
+    """An event of the scenario, in words."""
 
     time: float
     until: float | None
-    """None: for good"""
+    """None: it lasts to the end of the run"""
     what: str
     whom: tuple[str, ...]
-    """Robots, or buses"""
+    """Names of the robots or buses that it concerns"""
 
 
 @dataclass(frozen=True, slots=True)
 class WheelsReport:
-    """A robot's torques on their way to its wheels."""
+    """The commands to one robot's wheels."""
 
     protocol: str
     commands: int
     """Periods in which torques were sent"""
     stopped: Mapping[str, int]
-    """Torques that became zero before the bus, by reason"""
+    """Torques that were replaced by zero before the bus, by reason"""
     largest: float
     """Largest torque that was sent [N m]"""
     clipped: int = 0
@@ -99,17 +100,17 @@ class WheelsReport:
     saturated: int = 0
     """Periods in which the robot's own limits acted"""
     repeated: int = 0
-    """Torques for a period that had its frame: no frame"""
+    """Second torques for the same period; they made no frame"""
     skipped: int = 0
-    """Periods without torques between two that had them"""
+    """Periods without torques between two periods with torques"""
     refused: Mapping[str, int] = field(default_factory=dict)
-    """Frames of the drives that were refused, by reason"""
+    """Frames of the drives that the host refused, by reason"""
     came_up: float | None = None
     """When both wheels first took torque [s]; None: never, or no drive answers"""
     enabled: bool | None = None
-    """At the end of the run; None where no drive answers"""
+    """Whether both wheels take torque at the end of the run; None where no drive answers"""
     fault: str = ""
-    """What a drive reported to be wrong at the end; empty if nothing was"""
+    """The fault of the drives at the end of the run; empty without one"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +118,11 @@ class DriveReport:
     """The virtual drives of a robot."""
 
     refused: Mapping[str, int]
-    """Frames that they refused, by reason"""
+    """Frames that the drives refused, by reason"""
     lost: int
-    """Frames that their queues had no room for"""
+    """Frames that were lost because a drive's queue was full or its controller was bus-off"""
     temperature: float
-    """Of the hotter winding [°C]"""
+    """Temperature of the hotter winding [°C]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,24 +131,26 @@ class DrivesReport:
 
     robots: Mapping[str, DriveReport]
     refused: Mapping[str, int]
-    """Messages of other processes that were refused, by reason"""
+    """Messages of other processes that the drives refused, by reason"""
     foreign: int = 0
-    """Frames on their buses that nobody of the run had announced"""
+    """Frames on the buses that no process of the run had announced"""
     failed: int = 0
-    """Frames that a bus did not take (wall clock)"""
+    """Frames that a bus did not accept (wall clock)"""
     buses: tuple[BusReport, ...] = ()
-    """What the drives know of each bus; part of the run's `CanReport.buses`"""
+    """The drives' reports of the buses; `CanReport.with_drives` merges them into the run's"""
 
 
 @dataclass(frozen=True, slots=True)
 class TorqueTimes:
-    """Torques on a wall clock: how many came to the bus, and how long after the state they were computed from [s]."""
+    """Torques on a wall clock.  Latency is the time from the state that a torque was computed from to the end of its frame
+    on the bus [s]."""
 
     periods: int
-    """Torques that there were to be"""
+    """Number of torques that all robots should send"""
     came: int
+    """Number of torques that reached the bridge"""
     in_time: int
-    """Within a torque period of the state"""
+    """Number of torques with a latency of less than a torque period"""
     latency_median: float | None
     latency_p99: float | None
     latency_max: float | None
@@ -156,7 +159,7 @@ class TorqueTimes:
 
 @dataclass(frozen=True, slots=True)
 class FindingReport:
-    """Something that breaks the contract of a bus."""
+    """A finding of the referee: something on a bus that breaks the plan or the protocol."""
 
     time: float
     bus: str
@@ -165,12 +168,12 @@ class FindingReport:
     kind: str
     text: str
     robot: str
-    """Empty where it is nobody's"""
+    """Name of the robot; empty if the finding concerns no single robot"""
 
 
 @dataclass(frozen=True, slots=True)
 class TimingReport:
-    """When the frames of an identifier came [s]; None where there were too few."""
+    """The periods between the frames of one identifier [s]; None if there were too few frames."""
 
     frames: int
     period_mean: float | None = None
@@ -182,7 +185,7 @@ class TimingReport:
 
 @dataclass(frozen=True, slots=True)
 class RefereeReport:
-    """What the referee saw and found."""
+    """The referee's report."""
 
     frames: int
     unknown: int
@@ -190,11 +193,11 @@ class RefereeReport:
     kinds: Mapping[str, int]
     """Findings by kind"""
     findings: tuple[FindingReport, ...]
-    """The first ones, in full"""
+    """The first findings, in full"""
     identifiers: Mapping[str, TimingReport]
-    """By bus and identifier, `can0:101`"""
+    """By bus and identifier, for example `can0:101`"""
     source: str = "can.log"
-    """What it judged: `can.log`, or `bus` if it listened itself"""
+    """Where the frames came from: `can.log`, or `bus` if the referee listened itself"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,47 +207,48 @@ class CanReport:
     path: str
     """`mirror` or `closed`"""
     timing: str | None
-    """`bits` or `ideal`; None where torque is mirrored"""
+    """`bits` or `ideal`; None on the mirrored path"""
     url: str
-    """Where frames could be heard"""
+    """URLs of the buses"""
     listen: str
-    """What to type to hear them; empty if nobody else can"""
+    """The command that shows the frames; empty if no other process can see them"""
     torque_scale: float
-    """Of frames with torques in whole numbers [N m per bit]"""
+    """Torque per bit in frames with torques as whole numbers [N m]"""
     log_start: float
-    """Run time of the first instant of can.log [s]: before 0 where drives are brought up"""
+    """Run time at which can.log begins [s]: negative if drives are brought up"""
     frames: int
     load_mean: float
-    """Of the busiest bus"""
+    """Load of the busiest bus"""
     fit: tuple[str, ...]
-    """Whether the frames fit each bus, in one line each"""
+    """Whether the frames fit, one line for each bus"""
     advice: tuple[str, ...]
-    """What would make them fit"""
+    """Changes that would make the frames fit"""
     buses: tuple[BusReport, ...]
     scheduled: tuple[ScheduledEvent, ...]
     sent: int | None
-    """None, here and below, where nobody knows: the run was killed and recovered"""
+    """Frames that the buses accepted.  This and the next four fields are None if the run was killed and recovered."""
     failed: int | None
     """Frames that a bus refused"""
     dropped: int | None
-    """Frames given up because a bus's queue stayed full"""
+    """Frames given up because the queue of a bus stayed full"""
     log_lost: int | None
-    """Lines that can.log lacks"""
+    """Lines that are missing in can.log"""
     log_error: str | None
+    """The last error of writing can.log"""
     robots: Mapping[str, WheelsReport]
     foreign: int = 0
-    """Frames that nobody of this run had announced"""
+    """Frames that no process of this run had announced"""
     refused: Mapping[str, int] = field(default_factory=dict)
-    """Messages of other processes that were refused, by reason"""
+    """Messages of other processes that the bridge refused, by reason"""
     drives: DrivesReport | None = None
     torque: TorqueTimes | None = None
     referee: RefereeReport | None = None
     messages: int = 0
-    """Messages that the bridge sent to those who watch"""
+    """Messages that the bridge sent to recorders and other listeners"""
 
     @property
     def stopped(self) -> dict[str, int]:
-        """Torques that became zero before the bus, by reason, over all robots; the most frequent reason first."""
+        """Torques that were replaced by zero before the bus, by reason, over all robots; the most frequent reason first."""
         counts: dict[str, int] = {}
         for robot in self.robots.values():
             for reason, count in robot.stopped.items():
@@ -252,7 +256,7 @@ class CanReport:
         return dict(sorted(counts.items(), key=lambda item: -item[1]))
 
     def with_drives(self, drives: DrivesReport) -> "CanReport":
-        """Returns the report with that of the virtual drives, whose buses are the same."""
+        """Returns this report with the report of the virtual drives added."""
         buses = (
             tuple(bus.plus(more) for bus, more in zip(self.buses, drives.buses, strict=True))
             if drives.buses
@@ -263,7 +267,7 @@ class CanReport:
 
 @dataclass(frozen=True, slots=True)
 class BridgeProgress:
-    """How bridge and drives stand, for a live table."""
+    """The present state of bridge and drives, for a live table."""
 
     url: str = ""
     load: float = 0.0
@@ -271,11 +275,11 @@ class BridgeProgress:
     stopped: str = ""
     faults: tuple[str, ...] = ()
     note: str = ""
-    """Why the run stands still, if a bus is the reason"""
+    """Why the run waits for a bus; empty if it does not"""
 
 
 def stopped_text(counts: Sequence[Mapping[str, int]]) -> str:
-    """Returns how many torques became zero before the bus, by reason, in words."""
+    """Returns in words how many torques were replaced by zero before the bus, by reason."""
     total: dict[str, int] = {}
     for count in counts:
         for reason, number in count.items():

@@ -1,9 +1,9 @@
-/* Lets User Mode Linux before 6.13 run on CPUs with AMX; compiled and preloaded by vcan.sh where it is needed.
+/* Makes User Mode Linux before 6.13 run on CPUs with AMX. vcan.sh compiles and preloads it where it is needed.
  *
- * Such a kernel keeps the extended registers of a process (x87 to AVX-512) in an area of fixed size. The host takes
- * registers only as one area as large as all that the CPU has, which AMX makes larger: every PTRACE_SETREGSET fails with
- * EFAULT, and the guest dies at its first process. This puts the guest's area into one of the host's size. What it does
- * not cover (AMX tiles) no process of the guest can have switched on.
+ * Such a kernel keeps the extended registers of a process (x87 to AVX-512) in an area of fixed size. The host accepts only
+ * an area for all registers of the CPU, which AMX makes larger. So every PTRACE_SETREGSET fails with EFAULT, and the guest
+ * dies at its first process. This library copies the guest's area into one of the host's size. The rest of that area (AMX
+ * tiles) is unused, since no process of the guest can switch AMX on.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -31,7 +31,7 @@ long ptrace(enum __ptrace_request request, ...)
     va_end(rest);
     if (request == PTRACE_SETREGSET && address == (void *)NT_X86_XSTATE) {
         const struct iovec *part = data;
-        if (!whole.iov_len) { /* the first time: its size, and what belongs behind the guest's part */
+        if (!whole.iov_len) { /* the first call reads the size of the host's area and the registers after the guest's part */
             whole.iov_len = sizeof area;
             if (next(PTRACE_GETREGSET, pid, address, &whole))
                 whole.iov_len = 0;

@@ -126,7 +126,7 @@ class PartGroup:
         try:
             found = installed[use].load()
         except Exception as error:
-            raise PartError(f"the installed {installed[use].value} cannot be loaded: {_said(error)}") from None
+            raise PartError(f"the installed {installed[use].value} cannot be loaded: {_error_text(error)}") from None
         return self._checked(found, use), None
 
     def make(self, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
@@ -138,7 +138,7 @@ class PartGroup:
             errors = error.errors(include_url=False)
             raise PartError("wrong parameters", errors=errors, model=found) from None
         except Exception as error:  # a part's own validator may raise anything
-            raise PartError(f"{use} refuses its parameters: {_said(error)}") from None
+            raise PartError(f"{use} refuses its parameters: {_error_text(error)}") from None
         return Part(use, made.model_dump(mode="json", exclude_none=True), source, made)
 
     def _checked(self, found: Any, use: str) -> type[Plugin]:
@@ -226,9 +226,9 @@ def _module(source: Source) -> ModuleType:
         del sys.modules[name]
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise PartError(f"{source.name}: {_said(error)}") from None
+        raise PartError(f"{source.name}: {_error_text(error)}") from None
     return module
 
 
-def _said(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

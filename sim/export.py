@@ -4,6 +4,7 @@ import csv
 from pathlib import Path
 
 from echelon.errors import UsageError
+from echelon.files import replacing
 from echelon.sim.finished_run import Run
 from echelon.sim.results.tables import Table
 
@@ -16,7 +17,7 @@ def export_csv(run: Run, folder: Path) -> list[Path]:
     files = []
     for name, table in run.tables.items():
         files.append(folder / f"{name}.csv")
-        with files[-1].open("w", encoding="utf-8", newline="") as file:
+        with replacing(files[-1]) as partial, partial.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(table.columns)
             writer.writerows(zip(*(column.tolist() for column in table.columns.values()), strict=True))
@@ -36,7 +37,8 @@ def export_parquet(run: Run, folder: Path) -> list[Path]:
     files = []
     for name, table in run.tables.items():
         files.append(folder / f"{name}.parquet")
-        parquet.write_table(_arrow(table), files[-1])
+        with replacing(files[-1]) as partial:
+            parquet.write_table(_arrow(table), partial)
     return files
 
 

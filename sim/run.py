@@ -21,8 +21,8 @@ from typing import Final
 
 from echelon import __version__
 from echelon.bridge.reports import RefereeReport
-from echelon.bridge.stations.bridge import open_bridge
 from echelon.bridge.stations.closed import LOG
+from echelon.bridge.stations.opening import open_bridge
 from echelon.errors import PartRunError
 from echelon.files import write_text
 from echelon.messages import Message

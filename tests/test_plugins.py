@@ -85,7 +85,7 @@ def test_a_plant_from_a_file_moves_robots(folder: Path) -> None:
     Engine(plan).run()
 
 
-def test_a_pickled_plan_takes_the_text_along(folder: Path) -> None:
+def test_a_pickled_plan_holds_the_text_of_its_files(folder: Path) -> None:
     _, plan = load(folder / "mine.toml", [USE_SPIRAL, USE_PLANT])
     data = pickle.dumps(plan)
     for name in [name for name in sys.modules if name.startswith("echelon_part_")]:
@@ -98,7 +98,9 @@ def test_a_pickled_plan_takes_the_text_along(folder: Path) -> None:
     assert again.robots[3].model.made.share == 0.5
 
 
-def test_files_of_one_name_in_two_folders_do_not_meet(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_files_of_one_name_in_two_folders_are_different_modules(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     other = tmp_path_factory.mktemp("other")
     (other / "mine.toml").write_text((folder / "mine.toml").read_text())
     (other / "my_paths.py").write_text(SPIRAL.replace("t * c, t * s]", "2 * t * c, t * s]"))

@@ -2,7 +2,6 @@
 
 import ast
 import faulthandler
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from echelon.bridge.can.bus_url import interface_is_up
+from support.vcan import vcan_required
 
 ROOT = Path(__file__).parents[1]
 INSIDE = ROOT / "tests" / "vcan"
@@ -38,11 +38,6 @@ class Notice:
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("NOT TESTED: real vcan", red=True, bold=True)
         terminalreporter.line(self.text)
-
-
-def required() -> bool:
-    """Whether there must be a vcan, and nothing may be skipped."""
-    return bool(os.environ.get("CI") or os.environ.get("ECHELON_REQUIRE_VCAN"))
 
 
 def read_report(path: Path) -> dict[str, str]:
@@ -74,7 +69,7 @@ def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     )
     if run.returncode == NO_VCAN:
         why = f"no vcan can be had here: {run.stderr.strip()}"
-        if required():
+        if vcan_required():
             pytest.fail(why)
         request.config.pluginmanager.register(Notice(f"{len(NAMES)} tests of CAN frames on a real interface. {why}"))
         pytest.skip(why)
@@ -93,6 +88,6 @@ def test_all_of_them_ran(results: dict[str, str]) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_in_guest(results: dict[str, str], name: str) -> None:
     said = results.get(name, "did not run")
-    if said.startswith("skipped") and not required():
+    if said.startswith("skipped") and not vcan_required():
         pytest.skip(said)
     assert not said, said

@@ -1,1 +1,1 @@
-"""CAN buses and logs: sockets, URLs, files.  Where python-can is imported."""
+"""CAN buses and logs: sockets, URLs, files.  Only this folder imports python-can."""

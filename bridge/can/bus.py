@@ -1,10 +1,12 @@
-"""CAN buses by URL (bridge.can.bus_url). The only module, with bridge.can.wires, that knows python-can.
+"""CAN buses by URL (bridge.can.bus_url): opening, sending, receiving.
 
-Frames are classic ones with 11-bit identifiers. On udp_multicast all groups that share a port on one host hear each
-other: two buses need two ports. Its datagrams do not leave the host. What a bus sent itself it does not receive.
+All frames are classic CAN frames with 11-bit identifiers. A bus does not receive the frames that it sent itself.
 
-python-can opens the buses, and says what a datagram looks like. Its send() and recv() cost several times the system call,
-so frames go to the sockets and come from them directly.
+On udp_multicast, groups with the same port on one host hear each other. So two buses need two ports. The datagrams do not
+leave the host.
+
+Only this module and bridge.can.wires use python-can. It opens the buses and defines the format of a datagram. Its send()
+and recv() take several times as long as the system call, so this module reads and writes the sockets directly.
 """
 
 import errno
@@ -22,14 +24,14 @@ from can.interfaces.socketcan import SocketcanBus
 from echelon.bridge.can.bus_url import Address, parse
 from echelon.bridge.can.wires import Datagrams, RawCan, Wire, enlarge_buffers
 
-_STAMP = struct.Struct("@ll")  # struct timespec, what SO_TIMESTAMPNS gives
+_STAMP = struct.Struct("@ll")  # struct timespec, as SO_TIMESTAMPNS returns it
 _STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)
 _TRIES = 10
 _AT_ONCE = int(socket.MSG_DONTWAIT)
-_PAUSE = 0.0005  # [s]; with _TRIES, one full queue holds the caller up for 5 ms at most
+_PAUSE = 0.0005  # [s]; _TRIES pauses: a full queue delays the caller by 5 ms at most
 _SKEW_NS = 1_000_000
-"""A frame that is stamped by less than this before the frame in front of it came after it all the same: processors stamp
-frames of several senders side by side, some microseconds before they put them into one queue."""
+"""Time stamps may run backwards by less than this; the later frame then gets the stamp of the one before it.  Processors
+stamp frames of several senders in parallel, some microseconds before the frames enter the common queue."""
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
 
 
@@ -44,23 +46,27 @@ class Received(NamedTuple):
 
 @dataclass(slots=True)
 class BusCounts:
-    """What became of the frames: accepted by the bus; refused by it (interface down or gone); given up because its
-    queue stayed full. `received` counts those that came, `recv_failed` errors while receiving."""
+    """Counts of one bus."""
 
     sent: int = 0
+    """Frames that the bus accepted"""
     failed: int = 0
+    """Frames that the bus refused: its interface is down or gone"""
     dropped: int = 0
+    """Frames given up because the queue of the bus stayed full"""
     received: int = 0
+    """Frames received"""
     recv_failed: int = 0
+    """Errors while receiving"""
 
 
 def open_bus(url: str) -> "Bus":
-    """Opens a bus. Raises ValueError for a URL that is none, and OSError where the bus cannot be had."""
+    """Opens a bus. Raises ValueError for an invalid URL, and OSError if the bus cannot be opened."""
     address = parse(url)
     options: dict[str, dict[str, Any]] = {
         "socketcan": {"ignore_rx_error_frames": True},
         "udp_multicast": {"port": address.port, "hop_limit": 0, "fd": False},
-        # a queue that nobody reads must not grow without end
+        # the bound keeps a queue that nobody reads from growing forever
         "virtual": {"preserve_timestamps": True, "rx_queue_size": 1 << 16},
     }
     try:
@@ -95,7 +101,7 @@ def _wire(bus: can.BusABC, address: Address) -> Wire | None:
 
 
 class Bus:
-    """A bus to send frames on. Trouble on it is survived and counted in `counts`, the last error kept in `error`."""
+    """An open bus. Errors on the bus do not raise: `counts` counts them, and `error` keeps the last one."""
 
     __slots__ = ("_bus", "_last_ns", "_message", "_sleep", "_tries", "_wire", "counts", "error", "url")
 
@@ -106,7 +112,7 @@ class Bus:
         wire: Wire | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.url = url  # in full, as other processes need it
+        self.url = url  # without `auto`, so that other processes open the same bus
         self.counts = BusCounts()
         self.error: Exception | None = None
         self._bus = bus
@@ -118,18 +124,19 @@ class Bus:
 
     @property
     def channel(self) -> str:
-        """The word that names the bus in a log: the interface, or the kind of bus where there is none."""
+        """The word that names the bus in a log: the interface of a SocketCAN bus, otherwise the kind of bus."""
         kind, _, rest = self.url.partition(":")
         return rest if kind == "socketcan" else kind
 
     def send(self, can_id: int, data: bytes, time_ns: int = 0, remote: bool = False) -> bool:
-        """Sends a frame, a remote one if `remote`; false if it was not accepted, which is counted. Blocks for 5 ms at most.
+        """Sends a data frame, or a remote frame if `remote`. Returns true if the bus accepted it.
 
-        `time_ns` is the time stamp that receivers on a virtual bus see; other buses put their own.
-        Raises ValueError for an identifier of more than 11 bits, more than 8 bytes, or a remote frame with data."""
+        A frame that is not accepted is counted. The call blocks for 5 ms at most. `time_ns` is the time stamp that receivers
+        on a virtual bus see; other buses make their own. Raises ValueError for an identifier of more than 11 bits, more than
+        8 bytes, or a remote frame with data."""
         if can_id >> 11 or len(data) > 8 or (remote and data):
             what = "remote frame" if remote else "frame"
-            raise ValueError(f"no classic CAN {what} with an 11-bit identifier: {can_id:#x}, {len(data)} bytes")
+            raise ValueError(f"not a classic CAN {what} with an 11-bit identifier: {can_id:#x}, {len(data)} bytes")
         if self._wire is not None:
             return self._send_raw(self._wire, self._wire.encode(can_id, data, remote))
         message = self._message
@@ -179,13 +186,14 @@ class Bus:
         return True
 
     def _drop(self) -> bool:
-        # a queue that stays full, as on a bus that is off, must not hold up every frame
-        self._tries = 1
+        self._tries = 1  # a queue that stays full (bus-off) would delay each further frame by 5 ms
         self.counts.dropped += 1
         return False
 
     def recv(self, timeout: float | None = 0.0) -> Received | None:
-        """The next frame, or None if there is none within `timeout` [s] (None: wait for ever) or receiving failed."""
+        """Returns the next frame, or None if none came within `timeout` [s] or receiving failed.
+
+        `timeout` None waits for ever."""
         if self._wire is not None:
             return self._recv_raw(self._wire, timeout)
         while True:
@@ -204,7 +212,7 @@ class Bus:
             return Received(message.arbitration_id, data, round(message.timestamp * 1e9), message.is_remote_frame)
 
     def _recv_raw(self, wire: Wire, timeout: float | None) -> Received | None:
-        deadline_s = None  # known once there is something to wait for
+        deadline_s = None  # set at the first wait, which saves the clock call if a frame is there already
         while True:
             try:
                 payload, stamps, _, address = wire.into.recvmsg(wire.size, _STAMP_SPACE, _AT_ONCE)
@@ -223,7 +231,7 @@ class Bus:
                 return None
             try:
                 frame = wire.decode(payload, address)
-            except Exception as error:  # whatever python-can makes of a datagram that is none of its own
+            except Exception as error:  # python-can raises all kinds of errors for a foreign datagram
                 self._recv_failed(error)
                 return None
             if frame is None:
@@ -242,7 +250,7 @@ class Bus:
         self.counts.recv_failed += 1
 
     def fileno(self) -> int:
-        """The file descriptor that is readable when there is something to receive. OSError on a virtual bus."""
+        """Returns the file descriptor that is readable when a frame is there. Raises OSError on a virtual bus."""
         try:
             return self._bus.fileno()
         except NotImplementedError as error:
@@ -262,6 +270,6 @@ class Bus:
 
 
 def _errno(error: BaseException) -> int | None:
-    """The error number of an OSError, or of the one that python-can made its own error from."""
+    """Returns the error number of an OSError, or of the OSError that caused an error of python-can."""
     cause = error if isinstance(error, OSError) else error.__cause__
     return cause.errno if isinstance(cause, OSError) else None

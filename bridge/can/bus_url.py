@@ -1,10 +1,11 @@
-"""URLs of CAN buses: what they say, and what `auto` stands for on this machine.
+"""URLs of CAN buses: parsing, and what `auto` means on this machine.
 
+URL                                  bus
 socketcan:vcan0                      an interface of the kernel
-udp_multicast:[group][:port]         several processes on one host without privileges; 239.74.163.2 and 43113 unless
-                                     given, an IPv6 group in brackets
+udp_multicast:[group][:port]         several processes on one host, without privileges; the defaults are 239.74.163.2 and
+                                     43113; an IPv6 group is in brackets
 virtual[:channel]                    inside this process
-auto                                 socketcan:vcan0 where that exists and is up, else udp_multicast on a free port
+auto                                 socketcan:vcan0 if it exists and is up, else udp_multicast on a free port
 """
 
 import fcntl
@@ -22,11 +23,14 @@ DEFAULT_INTERFACE = "vcan0"
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a bus is: the kind of interface, its name or the multicast group, and the port of the latter."""
+    """A parsed URL."""
 
     interface: str
+    """python-can's name of the kind of bus: `socketcan`, `udp_multicast` or `virtual`"""
     channel: str
+    """Name of the interface, or the multicast group"""
     port: int = 0
+    """Port of a multicast group"""
 
     def __str__(self) -> str:
         if self.interface != "udp_multicast":
@@ -36,9 +40,10 @@ class Address:
 
 
 def resolve_url(url: str, number: int = 0) -> str:
-    """The URL in full, with what `auto` stands for here and now, to be handed to all processes that share the bus.
+    """Returns the complete URL, in which `auto` is replaced by the bus that it means on this machine now.
 
-    Of several buses number 1 looks for vcan1, and so on. Raises ValueError for a URL that is none."""
+    All processes that share the bus get this URL. `number` is the number of the bus in the plan: for bus 1, `auto` tries vcan1
+    instead of vcan0, and so on. Raises ValueError for an invalid URL."""
     if url == "auto" and number:
         return resolve_url(
             f"socketcan:vcan{number}" if interface_is_up(f"vcan{number}") else f"udp_multicast::{_free_port()}"
@@ -47,7 +52,9 @@ def resolve_url(url: str, number: int = 0) -> str:
 
 
 def listen_command(url: str) -> str:
-    """What to type to see the frames of a bus; empty for one that is not visible from outside. ValueError as above."""
+    """Returns the command that shows the frames of a bus, or "" for a bus inside one process.
+
+    Raises ValueError for an invalid URL."""
     address = parse(url)
     if address.interface == "socketcan":
         return f"candump {address.channel}"
@@ -57,7 +64,7 @@ def listen_command(url: str) -> str:
 
 
 def parse(url: str) -> Address:
-    """Returns where a URL leads.  Raises ValueError for a URL that is none."""
+    """Returns the address that a URL stands for.  Raises ValueError for an invalid URL."""
     if url == "auto":
         if interface_is_up(DEFAULT_INTERFACE):
             return Address("socketcan", DEFAULT_INTERFACE)
@@ -88,7 +95,7 @@ def parse(url: str) -> Address:
 
 
 def interface_is_up(name: str) -> bool:
-    """Whether a network interface of this name exists and is up."""
+    """Returns whether a network interface of this name exists and is up."""
     request = struct.pack("16sH14x", name.encode()[:15], 0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         try:
@@ -99,7 +106,7 @@ def interface_is_up(name: str) -> bool:
 
 
 def _free_port() -> int:
-    port = DEFAULT_PORT  # which is for those who ask for it
+    port = DEFAULT_PORT  # never returned: it belongs to users who name no port
     while port == DEFAULT_PORT:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("", 0))

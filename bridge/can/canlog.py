@@ -1,8 +1,8 @@
-"""Writes `can.log`, the record of all frames of a run, in the format of `candump -l`:
+"""`can.log`, the record of all frames of a run: writing and reading.
+
+The format is that of `candump -l`, which log2asc, canplayer, `cantools decode` and python-can's LogReader read:
 
     (1700000000.010000) vcan0 101#E80324FA010700F3
-
-which log2asc, canplayer, `cantools decode` and python-can's LogReader read.
 """
 
 import os
@@ -15,26 +15,29 @@ from typing import NamedTuple, Self
 
 from echelon.bridge.protocols.frame import Frame
 
-FLUSH_NS = 100_000_000  # what a killed process may lose, at most twice this while frames come
+FLUSH_NS = 100_000_000  # how old lines get before they are written; a killed process loses at most twice this
 _MAX_LINES = 4096
 _LINE = re.compile(r"\((\d+)\.(\d{6})\) (\S+) ([0-9A-F]{3})#(?:(R)[0-8]?|((?:[0-9A-F]{2}){0,8}))(?: [RT])?")
 
 
 @dataclass(slots=True)
 class LogCounts:
-    """Lines handed to the operating system, and lines lost because it did not take them."""
+    """Counts of lines."""
 
     written: int = 0
+    """Lines handed to the operating system"""
     lost: int = 0
+    """Lines that the operating system did not take"""
 
 
 class CanLog:
-    """A log file. Nothing raises after it is open: a full disk is counted in `counts.lost` and told by `error`.
+    """A log file that is written during a run.
 
-    Lines that did not fit are dropped whole, and writing goes on when there is room again.
+    After it is open, no method raises. On a full disk, whole lines are dropped: `counts.lost` counts them and `error` holds
+    the last error. Writing goes on when there is room again.
 
-    Parameters: the file (overwritten), the name of the channel to note, and the wall-clock time [ns since 1970] of the
-    run's time zero. Raises OSError if the file cannot be opened, ValueError if the channel is no single word."""
+    Parameters: `path` of the file, which is overwritten; `channel`, the name of the bus; `epoch_ns`, the wall-clock time of
+    run time zero [ns since 1970]. Raises OSError if the file cannot be opened, ValueError if the channel is not one word."""
 
     __slots__ = ("_channel", "_epoch_ns", "_fd", "_flushed_ns", "_lines", "_size", "counts", "error")
 
@@ -46,17 +49,17 @@ class CanLog:
         self._epoch_ns = epoch_ns
         self._lines: list[str] = []
         self._flushed_ns: int | None = None
-        self._size = 0  # of the file, in whole lines
+        self._size = 0  # size of the file up to its last whole line
         self.counts = LogCounts()
-        self.error: OSError | None = None  # the last one
+        self.error: OSError | None = None
 
     def write(
         self, time_ns: int, can_id: int, data: bytes, wall_ns: int, channel: str = "", remote: bool = False
     ) -> None:
-        """Notes a frame at `time_ns` of the run; `channel` is the bus if it is not the log's only one.
+        """Adds the line of a frame at run time `time_ns`; `channel` is the bus, unless it is the log's own.
 
-        `wall_ns` is any monotonic clock now: what is older than 0.1 s by it, or more than 4096 lines, goes to the file.
-        When frames stop coming, call `flush`."""
+        `wall_ns` is the present reading of a monotonic clock. Lines are written to the file when the oldest is more than 0.1 s
+        old, or when there are 4096. Call `flush` when no more frames come."""
         micros = (time_ns + self._epoch_ns) // 1000
         seconds, micros = divmod(micros, 1_000_000)
         content = "R" if remote else data.hex().upper()
@@ -68,7 +71,7 @@ class CanLog:
             self.flush()
 
     def flush(self) -> None:
-        """Hands all lines to the operating system, where they survive this process."""
+        """Hands all lines to the operating system; they then survive this process."""
         if not self._lines:
             return
         lines, self._lines = self._lines, []
@@ -100,15 +103,15 @@ class CanLog:
                 os.ftruncate(self._fd, self._size)
                 os.lseek(self._fd, self._size, os.SEEK_SET)
             except OSError:
-                pass  # a pipe, say: one line is broken, which readers skip
+                pass  # a pipe, for example, cannot be cut: one line is broken, and readers skip it
 
     def close(self) -> None:
-        """Flushes and closes the file; does nothing the second time."""
+        """Flushes and closes the file.  A second call does nothing."""
         if self._fd < 0:
             return
         self.flush()
         try:
-            os.close(self._fd)  # on a network file system this is where a full disk may show
+            os.close(self._fd)  # on a network file system a full disk may show only here
         except OSError as error:
             self.error = error
         self._fd = -1
@@ -123,7 +126,7 @@ class CanLog:
 
 
 class Logged(NamedTuple):
-    """A frame in a log: time [ns], the bus's name, the frame."""
+    """A frame in a log: time stamp [ns], name of the bus, frame."""
 
     time_ns: int
     channel: str
@@ -131,7 +134,7 @@ class Logged(NamedTuple):
 
 
 def read_log(path: Path) -> Iterator[Logged]:
-    """Yields the classic frames with 11-bit identifiers of a log as candump writes it; other lines are passed over.
+    """Yields the classic frames with 11-bit identifiers of a log in candump's format; skips all other lines.
 
     Raises OSError if the log cannot be read."""
     with path.open(encoding="ascii", errors="replace") as lines:

@@ -1,4 +1,4 @@
-"""What frames look like on sockets: the kernel's raw CAN frames, and python-can's multicast datagrams."""
+"""Frames as bytes on sockets: the kernel's raw CAN frames, and python-can's multicast datagrams."""
 
 import errno
 import os
@@ -12,14 +12,14 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of linux/can.h
 _REMOTE = 0x40000000  # CAN_RTR_FLAG
-_OTHER = 0xA0000000  # CAN_EFF_FLAG, CAN_ERR_FLAG: frames with 29-bit identifiers, and news of the controller
-_DATAGRAM = 4096  # bytes; one with a frame has some 160
+_OTHER = 0xA0000000  # CAN_EFF_FLAG | CAN_ERR_FLAG: frames with 29-bit identifiers, and messages of the controller
+_DATAGRAM = 4096  # largest datagram that is read [bytes]; one with a frame has about 160
 _BUFFER = 4 << 20
 _GONE = (errno.ENXIO, errno.ENODEV)
 
 
 class RawCan:
-    """Frames as the kernel's raw CAN sockets have them."""
+    """Frames on a raw CAN socket of the kernel."""
 
     size = _FRAME.size
 
@@ -29,9 +29,9 @@ class RawCan:
         self._interface = interface
 
     def mend(self, number: int | None) -> bool:
-        """After an error while sending: true if it may work now.
+        """Tries to repair the socket after sending failed with error `number`; returns true if a new attempt may work.
 
-        A socket whose interface was removed stays without one, even if it comes back under the same name."""
+        A socket whose interface was removed must be bound again, even if an interface of the same name comes back."""
         if number not in _GONE:
             return False
         try:
@@ -46,7 +46,7 @@ class RawCan:
 
     @staticmethod
     def decode(payload: bytes, address: object) -> tuple[int, bytes, bool] | None:
-        """Returns identifier, data, and whether it is a remote frame; None for what is not for us."""
+        """Returns identifier, data, and whether it is a remote frame; None for a frame that is not a classic 11-bit one."""
         can_id, length, data = _FRAME.unpack(payload)
         if can_id & _OTHER or length > 8:
             return None
@@ -54,18 +54,19 @@ class RawCan:
         return can_id & 0x7FF, b"" if remote else data[:length], remote
 
     def close(self) -> None:
-        pass  # python-can closes it
+        pass  # the socket is python-can's, which closes it
 
 
 class Datagrams:
-    """Frames as python-can's multicast buses have them.
+    """Frames as datagrams of python-can's multicast bus.
 
-    They are sent from a socket of our own: by its port, which nobody else on this host has, what comes back is known."""
+    They are sent from a second socket. Its port is unique on this host, so datagrams of our own that come back are known by
+    it and ignored."""
 
     size = _DATAGRAM
 
     def __init__(self, fileno: int, group: str, port: int) -> None:
-        """`fileno` is of python-can's socket, which is in the group.  Raises OSError if nothing can be sent there."""
+        """`fileno` is python-can's socket, a member of the group.  Raises OSError if the group cannot be reached."""
         self.into = socket.socket(fileno=os.dup(fileno))
         self.out = socket.socket(self.into.family, socket.SOCK_DGRAM)
         try:
@@ -87,9 +88,10 @@ class Datagrams:
         return self.out.sendto(payload, flags, self._target)
 
     def mend(self, number: int | None) -> bool:
-        """After an error while sending: false, for this frame is lost; but with the next the host's addresses may be others.
+        """Connects the socket anew after an error, since the host's addresses may have changed; returns false.
 
-        A socket that is connected saves the way to be looked up for each frame; some groups can do without only."""
+        The frame that failed is lost. A connected socket saves a look-up of the route for each frame. Some groups cannot be
+        connected to; their frames are sent with the address."""
         try:
             self.out.connect(self._target)
             self.send = self.out.send
@@ -105,17 +107,18 @@ class Datagrams:
         return parts[0] + data + parts[1]
 
     def decode(self, payload: bytes, address: Any) -> tuple[int, bytes, bool] | None:
-        """Returns identifier, data, and whether it is a remote frame; None for what is not for us.
+        """Returns identifier, data, and whether it is a remote frame.
 
-        Raises whatever python-can makes of a datagram that is none of its own."""
+        Returns None for a datagram of our own and for a frame that is not a classic 11-bit one. A foreign datagram may make
+        python-can raise any exception."""
         if address[1] == self._port:
             return None
         message = unpack_message(payload, check=True)
         if message.is_error_frame or message.is_fd or message.is_extended_id:
             return None
         can_id, remote = message.arbitration_id, message.is_remote_frame
-        if type(can_id) is not int or type(remote) is not bool:  # python-can takes 5.0 for a 5
-            raise TypeError(f"no identifier, or not known whether remote: {can_id!r}, {remote!r}")
+        if type(can_id) is not int or type(remote) is not bool:  # python-can accepts 5.0 as an identifier
+            raise TypeError(f"identifier must be an int and remote a bool, not {can_id!r} and {remote!r}")
         return can_id, b"" if remote else bytes(message.data), remote
 
     def close(self) -> None:
@@ -124,7 +127,7 @@ class Datagrams:
 
 
 def _around_data(can_id: int, length: int, remote: bool) -> tuple[bytes, bytes]:
-    """What python-can's datagram has before and after the data of a frame."""
+    """Returns the bytes of python-can's datagram before and after the data of a frame."""
     packed = [
         pack_message(
             can.Message(
@@ -145,7 +148,7 @@ Wire = RawCan | Datagrams
 
 
 def enlarge_buffers(one: socket.socket) -> None:
-    """Asks for buffers that hold a burst while a process waits for its turn; the kernel grants what it allows."""
+    """Asks the kernel for large buffers, so that a burst is not lost while the process waits for a processor."""
     for option, force in ((socket.SO_SNDBUF, 32), (socket.SO_RCVBUF, 33)):  # SO_SNDBUFFORCE, SO_RCVBUFFORCE
         try:
             one.setsockopt(socket.SOL_SOCKET, force, _BUFFER)

@@ -1,8 +1,13 @@
-"""Hosts, drives, observers and masters of protocols that others wrote: each call of theirs is checked.
+"""Hosts, drives, observers and masters of users' own protocols, with every call checked.
 
-What raises, what returns anything but frames, and a frame with an identifier that the protocol does not name, which may be
-somebody else's on the bus, raises PartRunError: one line that names file, class, robot and call.  After each call what a host
-says of itself is read and checked, so that reading it never raises: who takes the torque away must not be stopped by it.
+PartRunError, one line that names file, class, robot and call, is raised if
+
+- a call raises;
+- a call returns anything but frames;
+- a frame has an identifier that the protocol does not name, since this may be another robot's.
+
+The properties of a host are read and checked after each call.  So reading them later never raises: the code that takes the
+torque away must not be stopped by them.
 """
 
 from collections import Counter
@@ -21,7 +26,9 @@ from echelon.plugins import Part
 
 
 class Caller:
-    """Calls what others wrote.  `who` is theirs in words, `allowed` are the identifiers of frames that it may send."""
+    """Calls the code of a user's own protocol.
+
+    `who` names it in error messages; `allowed` are the identifiers of the frames that it may send."""
 
     def __init__(self, who: str, allowed: frozenset[int]) -> None:
         self.who, self.allowed = who, allowed
@@ -35,11 +42,11 @@ class Caller:
         return cls(f"{part.use} of {robot.name}", allowed)
 
     def wrong(self, text: str) -> PartRunError:
-        """Returns the error that says what is wrong."""
+        """Returns the error with this text."""
         return PartRunError(f"{self.who}: {text}")
 
     def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Returns what a function returns."""
+        """Calls a function and returns its result; `what` names the function in errors."""
         try:
             return function(*arguments)
         except Exception as error:
@@ -47,7 +54,7 @@ class Caller:
             raise self.wrong(f"{what} raised {text}") from error
 
     def make(self, what: str, interface: type, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Returns what a function makes, which has everything that an interface asks for."""
+        """Calls a function that makes an object, and returns it if it has all attributes of an interface."""
         made = self.call(what, function, *arguments)
         asked = sorted(name for name in {*vars(interface), *get_annotations(interface)} if not name.startswith("_"))
         if lacking := [name for name in asked if not self.call(what, hasattr, made, name)]:
@@ -57,21 +64,21 @@ class Caller:
         return made
 
     def identifiers(self, what: str, made: Any) -> frozenset[int]:
-        """Returns the identifiers that something listens to."""
+        """Returns the identifiers of a made object; they must be whole numbers."""
         found = self.call(what, lambda: made.identifiers)
         if not (isinstance(found, (set, frozenset)) and all(type(can_id) is int for can_id in found)):
             raise self.wrong(f"{what}: identifiers must be a set of numbers, not {found!r:.60}")
         return frozenset(found)
 
     def periods(self, what: str, function: Callable[..., Any], *arguments: Any) -> dict[int, int]:
-        """Returns the identifiers that come regularly, with their periods [ns]."""
+        """Calls a function that returns periods [ns] by identifier."""
         found = self.call(what, function, *arguments)
         if not (isinstance(found, dict) and all(type(one) is int and one > 0 for one in found.values())):
             raise self.wrong(f"{what}: must be periods [ns] by identifier, not {found!r:.60}")
         return found
 
     def frames(self, what: str, function: Callable[..., Any], *arguments: Any) -> list[Frame]:
-        """Returns the frames that a function returns."""
+        """Calls a function that returns frames."""
         frames = self.call(what, function, *arguments)
         if not isinstance(frames, list):
             raise self.wrong(f"{what} must return a list of frames, not {frames!r:.60}")
@@ -80,7 +87,7 @@ class Caller:
         return frames
 
     def check(self, what: str, frame: Any) -> None:
-        """Checks a frame."""
+        """Raises PartRunError for an invalid frame or identifier."""
         if not (isinstance(frame, Frame) and type(frame.can_id) is int and type(frame.remote) is bool):
             raise self.wrong(f"{what} must return frames (bridge.protocols.frame.Frame), not {frame!r:.60}")
         if not (isinstance(frame.data, bytes) and len(frame.data) <= 8):
@@ -90,7 +97,7 @@ class Caller:
 
 
 class CheckedHost:
-    """A host that others wrote."""
+    """The host of a user's own protocol."""
 
     def __init__(self, robot: RobotPlan) -> None:
         self._caller = Caller.of(robot)
@@ -102,7 +109,7 @@ class CheckedHost:
         self._read("host")
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns what is due besides torques."""
+        """Returns all due frames except torques."""
         return self._frames("poll", time_ns)
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
@@ -128,7 +135,7 @@ class CheckedHost:
         self._read("receive")
 
     def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
-        """Returns the frames that carry wheel torques [N m] and nothing else."""
+        """Returns the frames for wheel torques [N m] on the mirrored path."""
         return self._frames("mirror", tau_right, tau_left, enable, saturated)
 
     def _frames(self, method: str, *arguments: Any) -> list[Frame]:
@@ -137,7 +144,7 @@ class CheckedHost:
         return frames
 
     def _read(self, after: str) -> None:
-        """Takes what the host says of itself."""
+        """Reads and checks the properties of the host; `after` names the call before."""
         host, what = self._host, f"its host after {after}"
         enabled, fault, torque, torque_ns, clipped = self._caller.call(
             what, lambda: (host.enabled, host.fault, host.torque, host.torque_ns, host.clipped)
@@ -157,7 +164,7 @@ class CheckedHost:
 
 
 class CheckedDrive:
-    """A virtual drive that others wrote, number `number` of a robot's."""
+    """A virtual drive of a user's own protocol, number `number` of a robot."""
 
     def __init__(self, robot: RobotPlan, number: int) -> None:
         protocol: DriveProtocol = robot.drive.protocol.made
@@ -174,18 +181,18 @@ class CheckedDrive:
 
     @property
     def due_ns(self) -> int:
-        """When it next has something to do on its own."""
+        """When `advance` must be called next."""
         due_ns = self._caller.call("its drive's due_ns", lambda: self._drive.due_ns)
         if type(due_ns) is not int:
             raise self._caller.wrong(f"its drive's due_ns must be a time [ns], not {due_ns!r:.60}")
         return due_ns
 
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
-        """Takes a frame; returns what it answers at once."""
+        """Takes a frame; returns the immediate answers."""
         return self._caller.frames("its drive's receive", self._drive.receive, time_ns, frame)
 
     def advance(self, time_ns: int) -> list[Frame]:
-        """Lets time pass; returns what it sends on its own until then."""
+        """Lets time pass; returns the frames that the drive sends by itself."""
         frames = self._caller.frames("its drive's advance", self._drive.advance, time_ns)
         if (due_ns := self.due_ns) <= time_ns:
             raise self._caller.wrong(f"its drive's due_ns is {due_ns}, though advance({time_ns}) has done what was due")
@@ -201,7 +208,7 @@ class CheckedDrive:
 
 
 class CheckedObserver:
-    """An observer that others wrote."""
+    """The observer of a user's own protocol."""
 
     def __init__(self, robot: RobotPlan, closed: bool) -> None:
         make = robot.drive.protocol.made.observer
@@ -216,7 +223,7 @@ class CheckedObserver:
             raise self._caller.wrong(f"observer: cyclic must be of its identifiers, not {self.cyclic!r:.60}")
 
     def observe(self, time_ns: int, frame: Frame) -> list[Finding]:
-        """Takes a frame; returns what is wrong with it."""
+        """Takes a frame; returns its findings."""
         found: list[Finding] = self._caller.call("its observer's observe", self._observer.observe, time_ns, frame)
         if not (isinstance(found, list) and all(isinstance(finding, Finding) for finding in found)):
             raise self._caller.wrong(f"its observer's observe must return a list of Finding, not {found!r:.60}")
@@ -228,25 +235,25 @@ class CheckedObserver:
 
 
 class CheckedMaster:
-    """What a bus has one of, of a protocol that others wrote."""
+    """The master of a user's own protocol."""
 
     def __init__(self, caller: Caller, master: Master) -> None:
         self._caller, self._master = caller, master
 
     @classmethod
     def made_by(cls, part: Part[Any], period_ns: int, watchdog_ns: int) -> Self | None:
-        """Returns what a protocol makes for a bus, if it has that."""
+        """Returns the master that a protocol makes, or None if it has none."""
         caller = Caller(part.use, part.made.shared_identifiers())
         if caller.call("master", part.made.master, period_ns, watchdog_ns) is None:
             return None
         return cls(caller, caller.make("master", Master, part.made.master, period_ns, watchdog_ns))
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns what is due."""
+        """Returns the due frames."""
         return self._caller.frames("its master's poll", self._master.poll, time_ns)
 
     def sync(self) -> Frame | None:
-        """Returns the frame whose end is the end of a period, if there is one."""
+        """Returns the frame that must end with a period; None: there is none."""
         frame: Frame | None = self._caller.call("its master's sync", self._master.sync)
         if frame is not None:
             self._caller.check("its master's sync", frame)

@@ -1,4 +1,4 @@
-"""Signals of DBC messages, as protocols make them: little endian, numbered by their first bit.  Pure."""
+"""Signals of DBC messages: little endian, placed by the number of their first bit.  Pure."""
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -10,7 +10,7 @@ from cantools.database.conversion import BaseConversion
 from cantools.database.namedsignalvalue import NamedSignalValue
 
 BRIDGE: Final = "bridge"
-"""Who sends commands and hears feedback."""
+"""The DBC node that sends commands and receives feedback."""
 
 
 def number(
@@ -23,17 +23,17 @@ def number(
     signed: bool = True,
     choices: Mapping[int, str] | None = None,
 ) -> Signal:
-    """Returns a signal of whole numbers, each `scale` in `unit`, or one of `choices`."""
+    """Returns a signal of whole numbers.  One bit is `scale` in `unit`; `choices` names single values."""
     named: OrderedDict[int, str | NamedSignalValue] | None = None if choices is None else OrderedDict(choices)
     conversion = BaseConversion.factory(scale=scale, choices=named)
     return Signal(name, start, bits, receivers=[receiver], is_signed=signed, conversion=conversion, unit=unit)
 
 
 def flags(names: Mapping[int, str], receiver: str) -> list[Signal]:
-    """Returns a signal of one bit for each name, by the number of its bit."""
+    """Returns a signal of one bit for each name; `names` are by the number of the bit."""
     return [number(name, bit, 1, receiver, signed=False) for bit, name in names.items()]
 
 
 def names(kinds: Iterable[IntEnum]) -> dict[int, str]:
-    """Returns what the values of an enumeration mean, in lower case."""
+    """Returns the names of an enumeration's values in lower case, by value."""
     return {kind.value: kind.name.lower().replace("_", " ") for kind in kinds}

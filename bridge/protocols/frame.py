@@ -1,7 +1,7 @@
-"""What all drive protocols share: the frame, and what a virtual drive, its host and a bus's master are to those who run them.
+"""The frame, and the interfaces of virtual drive, host and master, which all drive protocols share.
 
-All are plain objects: frames and the time in, frames out.  They never wait, read no clock and send nothing themselves.
-What comes from the bus is checked, counted in `refused`, and dropped; it never raises.
+All of them are plain objects: frames and the time in, frames out.  They never wait, read no clock and send nothing themselves.
+Frames from the bus never raise: an invalid frame is counted in `refused` by its reason and dropped.
 """
 
 from collections import Counter
@@ -11,7 +11,7 @@ from echelon.bridge.protocols.motor import Fault, Motor
 from echelon.plan.can_plan import DrivePlan
 
 WHEELS: Final = ("right", "left")
-"""The wheels of a robot, in the order of all pairs"""
+"""The wheels of a robot; all pairs of wheel values have this order"""
 
 
 class Frame(NamedTuple):
@@ -23,104 +23,105 @@ class Frame(NamedTuple):
 
 
 def recovers_after_ns(plan: DrivePlan, time_ns: int) -> int | None:
-    """Returns how long after a fault a host clears it; None: never.
+    """Returns how long after a fault a host clears it [ns]; None: never.
 
-    Before run time 0, when drives are brought up, at once: they may be as an earlier run left them."""
+    Before run time 0 it clears faults at once: they may be left over from an earlier run."""
     return 0 if time_ns < 0 else plan.recover_ns
 
 
 class Drive(Protocol):
-    """A virtual drive: what answers on the bus, with the motor of one wheel or of both.
+    """A virtual drive: a node on the bus with the motor of one wheel or of both wheels.
 
-    Time never runs backwards; before a frame is handed over, `advance` is called for its time.
+    Time never runs backwards.  The caller calls `advance` for the time of a frame before it calls `receive`.
     """
 
     motors: tuple[Motor, ...]
     refused: Counter[str]
-    """Frames that were refused, by reason."""
+    """Refused frames, by reason."""
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers of the frames that it listens to."""
 
     @property
     def due_ns(self) -> int:
-        """When it next has something to do on its own."""
+        """When `advance` must be called next."""
 
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
-        """Takes a frame; returns what it answers at once."""
+        """Takes a frame; returns the immediate answers."""
 
     def advance(self, time_ns: int) -> list[Frame]:
-        """Lets time pass; returns what it sends on its own until then, what is due at `time_ns` included."""
+        """Lets time pass; returns the frames that the drive sends by itself up to and including `time_ns`."""
 
     def inject(self, time_ns: int, wheel: int, fault: Fault) -> list[Frame]:
-        """Makes a fault happen at one wheel (0 right, 1 left), on demand."""
+        """Makes a fault happen at one wheel (0 right, 1 left); returns the frames that are due."""
 
     def mend(self, time_ns: int, wheel: int, fault: Fault) -> None:
-        """Takes the cause of a fault away; what it latched stays latched until it is cleared over the bus."""
+        """Takes the cause of a fault away.  A latched fault stays until it is cleared over the bus."""
 
 
 class Host(Protocol):
-    """What commands a robot's drives: the bridge's side of a protocol, for both wheels of one robot.
+    """The bridge's side of a protocol: it commands the drives of both wheels of one robot.
 
-    A cycle is `poll`, then `command`, once per period, and `receive` for each frame that comes in between.
+    In each period the caller calls `poll` and then `command`, and `receive` for each frame that comes in between.
     """
 
     refused: Counter[str]
-    """Frames that were refused, by reason."""
+    """Refused frames, by reason."""
     clipped: int
-    """Torques that were cut to what a frame can carry."""
+    """Number of torques that were cut to the range of a frame."""
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers of the frames that it listens to."""
 
     @property
     def torque(self) -> tuple[float, float]:
-        """Torque of the right and left wheel as the drives last reported it [N m]; zeros before the first report."""
+        """The last reported torques of the right and the left wheel [N m]; zeros before the first report."""
 
     @property
     def torque_ns(self) -> int | None:
-        """When that report came; None before the first."""
+        """When that report came [ns]; None before the first.  With a drive per wheel it is the older of both."""
 
     @property
     def enabled(self) -> bool:
-        """True while both wheels take torque, as far as their drives said."""
+        """True while both wheels take torque, by what their drives reported."""
 
     @property
     def fault(self) -> str:
-        """What a drive reports to be wrong, in words; empty if nothing is."""
+        """The present fault of the drives in words; empty without one."""
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns what is due besides torques: to bring drives up, keep them alive, or clear a fault and enable anew."""
+        """Returns all due frames except torques: they bring drives up, keep them alive, clear faults and enable again."""
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
-        """Returns the frames for wheel torques [N m], finite ones; zeros are sent while a drive is not enabled."""
+        """Returns the frames for finite wheel torques [N m].  It sends zeros until both wheels are enabled."""
 
     def stop(self, time_ns: int) -> list[Frame]:
-        """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
+        """Returns frames that take the torque away at once and disable the drives.  They stay disabled until `start`."""
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns the protocol's own emergency stop: drives take the torque away by themselves; they stay so until `start`.
+        """Returns the protocol's own emergency stop, by which drives take the torque away themselves, until `start`.
 
-        `poll` and `command` repeat it where it seems to be lost."""
+        `poll` and `command` repeat it if it seems to be lost."""
 
     def start(self) -> None:
-        """Lets `poll` enable the drives (again), whatever was wrong until then.  A new host is started."""
+        """Lets `poll` enable the drives (again), whatever was wrong before.  A new host is started already."""
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""
 
     def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
-        """Returns the frames that carry wheel torques [N m], finite ones, and nothing else, whatever drives say: those of a
-        mirrored torque path, where nobody answers.  Unless `enable`, they ask for no torque."""
+        """Returns the frames for finite wheel torques [N m] on the mirrored path, where no drive answers.
+
+        They do not depend on what drives reported.  Without `enable` they command zero torque."""
 
 
 class Master(Protocol):
-    """What a bus has one of, whatever the number of robots on it: who keeps its time."""
+    """The frames that a bus needs once, whatever the number of robots on it: SYNC and the host's heartbeat."""
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns what is due; to be called once per period, early or late by less than half of it."""
+        """Returns the due frames; must be called once per period, early or late by less than half a period."""
 
     def sync(self) -> Frame | None:
-        """Returns the frame whose end is the end of a period, if there is one: drives sample then what they report."""
+        """Returns the frame that must end with a period, since drives sample their feedback then; None: there is none."""

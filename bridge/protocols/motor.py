@@ -1,21 +1,23 @@
-"""The motor behind a virtual drive: how the torque on one wheel's shaft follows what the protocol asks for.
+"""The motor behind a virtual drive: how the torque τ on a wheel's shaft follows the wanted torque.
 
-Setpoint: limited (torque limit, derated by temperature), then ramped with the slew limit.  Shaft torque follows it as a
-first-order lag, τ' = (setpoint - τ)/lag, in closed form between two events; without lag it is the setpoint:
+*Torque.*  The wanted torque is limited (torque limit, derated by temperature), then ramped with the slew limit.  This gives the
+setpoint of the current loop.  The shaft torque follows with a first-order lag, τ' = (setpoint - τ)/lag; without lag it is
+the setpoint.  Between two events the setpoint is s + k t, and the solution is exact:
 
-    setpoint = s + k t  gives  τ = s + k (t - lag) + (τ0 - s + k lag) e^(-t/lag)
+    τ = s + k (t - lag) + (τ0 - s + k lag) e^(-t/lag)
 
-What is slow is looked at every 10 ms, at multiples of `STEP_NS`, so that it does not depend on when anyone asks:
+*Slow quantities* are updated every 10 ms, at multiples of `STEP_NS`.  So they do not depend on the times of calls.  I is the
+current τ/torque_constant.
 
-- winding: thermal_time T' = ambient + thermal_resistance · resistance · I² - T, I = τ/torque_constant, exact for the mean
-  of I² in a step, since thermal times are seconds and more;
-- bus voltage V: power P = τ ω + resistance · I², its mean in the step, comes as P/V through the supply's resistance;
-  V = supply_voltage - supply_resistance · P/V is a quadratic equation, of which the larger root is the stable one.
-  Where there is none, the supply cannot give P; V is then half the supply voltage, where it gives most;
-- velocity: encoder counts in the step.
+- Winding temperature T: thermal_time T' = ambient + thermal_resistance · resistance · I² - T, solved exactly for the mean of
+  I² over the step.
+- Supply voltage V at the drive: V = supply_voltage - supply_resistance · P/V, with P the mean of τ ω + resistance · I² over the
+  step.  Of the two roots of this quadratic equation the larger one is stable.  If there is none, the supply cannot deliver
+  P; V is then half the supply voltage, where it delivers most.
+- Velocity: encoder counts over the step.
 
-A wheel on a bench, inertia ω' = τ - friction ω, moves by the mean torque between two events: exact while torque is
-constant, and as good as the rest needs while it lags, for events are milliseconds apart.
+*A wheel on a bench*, which no robot turns, moves by inertia ω' = τ - friction ω with the mean torque between two events.  This
+is exact while τ is constant.  While τ lags, the error is small, since events are milliseconds apart.
 """
 
 from enum import StrEnum
@@ -30,29 +32,30 @@ STEP: Final = STEP_NS * 1e-9
 
 
 class Fault(StrEnum):
-    """What can go wrong with a drive; each latches, and takes the torque away, but `STUCK_TORQUE` and `SILENT`."""
+    """Faults of a drive.  All but `STUCK_TORQUE` and `SILENT` take the torque away and latch."""
 
     OVER_TEMPERATURE = "over_temperature"
     ENCODER_LOSS = "encoder_loss"
     BROWN_OUT = "brown_out"
     STUCK_TORQUE = "stuck_torque"
-    """The shaft torque stays what it is, whatever is commanded, for as long as the fault lasts."""
+    """The shaft torque does not change while the fault lasts, whatever is commanded."""
     SILENT = "silent"
-    """The drive neither hears nor says anything, and its torque is zero, for as long as the fault lasts."""
+    """The drive receives and sends nothing while the fault lasts; its torque is zero."""
     WATCHDOG = "watchdog"
     ESTOP = "estop"
 
 
 LATCHING: Final = (Fault.OVER_TEMPERATURE, Fault.ENCODER_LOSS, Fault.BROWN_OUT)
-"""Faults that can be made to happen, and that the drive latches."""
+"""Faults on demand that the drive latches."""
 ON_DEMAND: Final = (*LATCHING, Fault.STUCK_TORQUE, Fault.SILENT)
-"""Faults that can be made to happen; the others come of what the bus says, or does not."""
+"""Faults that a scenario can make happen; the others come from frames on the bus, or from their absence."""
 
 
 class Motor:
-    """One wheel's motor; instants in ns, SI units.  The first call sets the time; it never runs backwards.
+    """The motor of one wheel.  Instants are in ns, all else in SI units.  The first call sets the time.
 
-    Raises ValueError for a plan that is none, time that runs backwards, and numbers that are not finite.
+    Raises ValueError for an impossible value in the plan, for time that runs backwards, and for a torque or a speed that is not
+    finite.
     """
 
     def __init__(self, plan: MotorPlan) -> None:
@@ -60,16 +63,17 @@ class Motor:
         self.plan = plan
         self._thermal_decay = exp(-STEP / plan.thermal_time) if plan.thermal_time else 0.0
         self._now_ns: int | None = None
-        self._next_ns = self._window_ns = 0  # the next step; where the mean begins
+        self._next_ns = self._window_ns = 0  # time of the next step; start of the mean torque
+        # wanted by the drive; within the limit; ramped; on the shaft
         self._wanted = self._target = self._setpoint = self._torque = 0.0
         self._limit = plan.torque_limit
-        self._slew = 0.0  # of the setpoint at present, with its sign
+        self._slew = 0.0  # present slope of the setpoint [N m/s]
         self._off = True
-        self._area = self._square = self._work = 0.0  # integrals of τ (since _window_ns), of τ² and τ ω (since a step)
+        self._area = self._square = self._work = 0.0  # integrals: τ since _window_ns; τ² and τ ω since the last step
         self._temperature, self._voltage = plan.ambient, plan.supply_voltage
         self._omega = self._turned = self._velocity = 0.0  # [rad/s], [rad], [rev/s]
         self._counts = 0  # at the last step
-        self._counts_lost = 0  # what the encoder said when it was lost
+        self._counts_lost = 0  # encoder counts when the encoder was lost
         self._driven = self._stuck = False
         self._injected: set[Fault] = set()
         self._tripped: Fault | None = None
@@ -82,7 +86,7 @@ class Motor:
 
     @property
     def setpoint(self) -> float:
-        """What the current loop is told: limited and ramped [N m]"""
+        """Setpoint of the current loop, limited and ramped [N m]"""
         return self._setpoint
 
     @property
@@ -92,37 +96,37 @@ class Motor:
 
     @property
     def current(self) -> float:
-        """[A]"""
+        """Current at the shaft torque [A]"""
         return self._torque / self.plan.torque_constant
 
     @property
     def current_setpoint(self) -> float:
-        """[A]"""
+        """Current at the setpoint [A]"""
         return self._setpoint / self.plan.torque_constant
 
     @property
     def temperature(self) -> float:
-        """Of the winding, at the last step [°C]"""
+        """Winding temperature at the last step [°C]"""
         return self._temperature
 
     @property
     def bus_voltage(self) -> float:
-        """Mean in the last step [V]"""
+        """Supply voltage at the drive, mean over the last step [V]"""
         return self._voltage
 
     @property
     def counts(self) -> int:
-        """Encoder counts since the start; what they were, while the encoder is lost"""
+        """Encoder counts since the start; they stay constant while the encoder is lost"""
         return self._counts_lost if Fault.ENCODER_LOSS in self._injected else self._encoder()
 
     @property
     def position(self) -> float:
-        """As the encoder has it [rev]"""
+        """Position by the encoder [rev]"""
         return self.counts / self.plan.encoder_counts
 
     @property
     def velocity(self) -> float:
-        """Encoder counts in the last step, per second [rev/s]"""
+        """Velocity by the encoder, mean over the last step [rev/s]"""
         return self._velocity
 
     @property
@@ -132,7 +136,7 @@ class Motor:
 
     @property
     def causes(self) -> frozenset[Fault]:
-        """Faults whose cause is there now, on demand or by physics: those a drive cannot clear."""
+        """Faults whose cause is present, on demand or by physics.  A drive cannot clear them."""
         found = self._injected - {Fault.STUCK_TORQUE}
         if self._temperature >= self.plan.temperature_limit:
             found.add(Fault.OVER_TEMPERATURE)
@@ -141,9 +145,9 @@ class Motor:
         return frozenset(found)
 
     def advance(self, time_ns: int) -> Fault | None:
-        """Lets time pass; returns a fault that its physics caused by then (over-temperature, brown-out).
+        """Lets time pass; returns a fault that physics caused by then: over-temperature or brown-out.
 
-        The torque is cut when that happens, even if it is noticed later.
+        The motor cuts the torque at the instant of the fault, even if `advance` is called later.
         """
         self._go(time_ns)
         fault, self._tripped = self._tripped, None
@@ -159,12 +163,12 @@ class Motor:
         self._aim()
 
     def cut(self, time_ns: int) -> None:
-        """Takes all torque away at once, without ramp or lag: the power stage is off."""
+        """Switches the power stage off: the torque is zero at once, without ramp or lag."""
         self._go(time_ns)
         self._cut()
 
     def set_speed(self, time_ns: int, omega: float) -> None:
-        """Sets the wheel's speed [rad/s]: a robot turns it.  A motor that is never told so has a wheel on a bench."""
+        """Sets the speed at which a robot turns the wheel [rad/s].  Without any call the wheel is on a bench."""
         if not isfinite(omega):
             raise ValueError(f"speed must be finite, not {omega!r}")
         self._go(time_ns)
@@ -181,7 +185,7 @@ class Motor:
     def inject(self, time_ns: int, fault: Fault) -> None:
         """Makes a fault happen: one of `LATCHING` cuts the torque, `STUCK_TORQUE` freezes it.
 
-        The others concern the drive: ValueError.
+        Raises ValueError for all others, which are faults of the drive, not of the motor.
         """
         self._go(time_ns)
         if fault not in (*LATCHING, Fault.STUCK_TORQUE):
@@ -194,7 +198,7 @@ class Motor:
             self._cut()
 
     def mend(self, time_ns: int, fault: Fault) -> None:
-        """Takes the cause of a fault away; the torque then is what it would be."""
+        """Takes the cause of a fault away.  After `STUCK_TORQUE` the torque follows the commands again."""
         self._go(time_ns)
         self._injected.discard(fault)
         if fault is Fault.STUCK_TORQUE and self._stuck:
@@ -219,7 +223,7 @@ class Motor:
             raise ValueError(f"time must not run backwards: {time_ns} ns after {now_ns} ns")
 
     def _run(self, to_ns: int) -> None:
-        """Follows the setpoint until an instant that is not after the next step."""
+        """Integrates to an instant, at most up to the next step."""
         assert self._now_ns is not None
         h = (to_ns - self._now_ns) * 1e-9
         self._now_ns = to_ns
@@ -242,7 +246,7 @@ class Motor:
             self._turn(area / h, h)
 
     def _follow(self, h: float, slew: float) -> None:
-        """Integrates the shaft torque over `h` while the setpoint goes with `slew`."""
+        """Integrates the shaft torque over `h` [s] while the setpoint changes by `slew` [N m/s]."""
         torque, setpoint, lag = self._torque, self._setpoint, self.plan.lag
         if self._stuck or (not slew and torque == setpoint):
             self._area += torque * h
@@ -264,16 +268,16 @@ class Motor:
         self._torque = a + slew * h + b
 
     def _turn(self, torque: float, h: float) -> None:
-        """Turns a wheel on a bench with a constant torque, exactly."""
+        """Turns a wheel on a bench for `h` [s] with a constant torque; the solution is exact."""
         x = self.plan.friction * h / self.plan.inertia
         part = -expm1(-x) / x if x else 1.0
-        rest = (1 - part) / x if x > 1e-5 else 0.5 - x / 6  # the difference of equal numbers is none
+        rest = (1 - part) / x if x > 1e-5 else 0.5 - x / 6  # a series, since 1 - part cancels for small x
         gain = torque * h / self.plan.inertia
         self._turned += (self._omega * part + gain * rest) * h
         self._omega = self._omega * exp(-x) + gain * part
 
     def _step(self) -> None:
-        """Measures what is slow, at a multiple of STEP_NS."""
+        """Updates the slow quantities, at a multiple of STEP_NS."""
         plan = self.plan
         self._next_ns += STEP_NS
         copper = plan.resistance * self._square / (STEP * plan.torque_constant * plan.torque_constant)
@@ -305,7 +309,7 @@ class Motor:
             self._aim()
 
     def _aim(self) -> None:
-        """Sets out for the wanted torque within the limit."""
+        """Starts the ramp to the wanted torque, cut to the limit."""
         limit, slew, target = self._limit, self.plan.torque_slew, self._wanted
         target = limit if target > limit else -limit if target < -limit else target
         self._target = target

@@ -1,4 +1,4 @@
-"""What a passive listener makes of a robot's frames: the interface that every protocol fills, and checks they share."""
+"""The interface of an observer: a passive listener to a robot's frames, which every protocol has."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -7,7 +7,9 @@ from echelon.bridge.protocols.frame import Frame
 
 
 class Finding(NamedTuple):
-    """Something on the bus that must not be: when, which identifier, what kind (short, to count by), and in words."""
+    """A frame, or a missing frame, that breaks the protocol or the plan.
+
+    `kind` is a short name by which findings are counted; `text` describes this one."""
 
     time_ns: int
     can_id: int
@@ -17,24 +19,26 @@ class Finding(NamedTuple):
 
 @dataclass(slots=True)
 class WheelReading:
-    """What the bus last said of one wheel; None is: not yet."""
+    """The last values of one wheel on the bus; None: none so far."""
 
     commanded: float | None = None
     """Wheel torque of the last command [N m]"""
     commanded_ns: int | None = None
+    """When the last command came [ns]"""
     reported: float | None = None
     """Wheel torque of the last feedback [N m]"""
     reported_ns: int | None = None
+    """When the last feedback came [ns]"""
     speed: float | None = None
     """Wheel speed of the last feedback [rad/s]"""
     state: str = ""
-    """The drive's state as it says, in the protocol's words"""
+    """The drive's last reported state, in the protocol's words"""
     fault: str = ""
-    """What it says is wrong, in the protocol's words; empty if nothing"""
+    """The drive's last reported fault, in the protocol's words; empty without one"""
 
 
 class Observer(Protocol):
-    """Listens to the frames of one robot, commands and feedback, and holds them against the protocol."""
+    """Listens to the frames of one robot, commands and feedback, and checks them against the protocol."""
 
     wheels: tuple[WheelReading, WheelReading]
     """Right and left"""
@@ -45,7 +49,7 @@ class Observer(Protocol):
 
     @property
     def cyclic(self) -> dict[int, int]:
-        """Identifiers that must come regularly, with their periods [ns]."""
+        """Cyclic identifiers with their periods [ns]."""
 
     def observe(self, time_ns: int, frame: Frame) -> list[Finding]:
-        """Takes a frame; returns what is wrong with it."""
+        """Takes a frame; returns its findings."""

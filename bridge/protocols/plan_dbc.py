@@ -1,4 +1,4 @@
-"""The DBC of a plan: every frame of every robot's drives on one bus, for candump, cantools, SavvyCAN.  Pure."""
+"""The DBC of a plan: the frames of all drives on one bus, for tools such as cantools and SavvyCAN.  Pure."""
 
 import re
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ from echelon.bridge.protocols.registry import dbc_messages, shared_messages
 from echelon.plan.plan import Plan
 
 _LONGEST = 23
-"""A DBC identifier has up to 32 characters; protocols add up to 9."""
+"""Longest identifier of a robot: a DBC identifier has up to 32 characters, and protocols add up to 9."""
 
 
 def identifiers(robots: Sequence[str]) -> list[str]:
-    """A valid DBC identifier for each robot's path name: g1/r3 becomes g1_r3, cut to fit, made unique by a number."""
+    """Returns a valid DBC identifier for each robot's path: g1/r3 becomes g1_r3, cut to fit, made unique by a number."""
     names: list[str] = []
     for robot in robots:
         plain = re.sub(r"\W", "_", robot, flags=re.ASCII)[:_LONGEST]
@@ -44,7 +44,7 @@ def plan_dbc(plan: Plan, bus: int = 0) -> str:
 
 
 def dbc_names(plan: Plan) -> list[str]:
-    """Returns the names of the files that a run leaves, bus by bus."""
+    """Returns the names of the DBC files in a run's folder, one for each bus."""
     if len(plan.can.buses) == 1:
         return ["torque.dbc"]
     return [f"torque-{bus.name}.dbc" for bus in plan.can.buses]

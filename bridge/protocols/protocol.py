@@ -1,11 +1,11 @@
-"""What a drive protocol is: the base class of all of them, those built in and those that others write.
+"""The base class of all drive protocols, built in or written by users (docs/architecture.md, 5.3).
 
-A protocol is one class.  It makes what commands a robot's drives (its host), the virtual drives, what listens (the observer)
-and the DBC, and says where the drives are on a bus.  Nothing outside its folder or file names it, except for the registry of
-those built in (bridge.protocols.registry).  docs/add-a-protocol.md shows how to write one.
+A protocol is one class.  It makes the host (which commands a robot's drives), the virtual drives, the observer (which listens)
+and the DBC messages, and says which identifiers and node ids the drives use.  No code outside its folder names a
+protocol, except the registry of the built-in ones (bridge.protocols.registry).  docs/add-a-protocol.md shows how to write one.
 
-All methods are pure.  A process of a run imports the class with the plan, whether it needs the protocol or not, so what takes
-long to import (cantools, a host, a drive) is imported in the methods.
+All methods are pure.  Every process of a run imports the class with the plan, whether it needs the protocol or not.  So slow
+imports (cantools, host, drive) are inside the methods.
 """
 
 from abc import ABC, abstractmethod
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 
 class DriveProtocol(Plugin, ABC):
-    """Base of all drive protocols; the fields of a class are its parameters."""
+    """Base of all drive protocols.  The fields of a class are its parameters."""
 
     wheels: ClassVar[tuple[tuple[int, ...], ...]] = ((0,), (1,))
-    """The wheels (0 right, 1 left) of each drive of a robot: a drive for each, or ((0, 1),), one for both"""
+    """The wheels (0 right, 1 left) of each drive of a robot: ((0,), (1,)) is a drive for each wheel, ((0, 1),) one for both"""
     nodes: ClassVar[range] = range(127)
-    """Node ids that a drive may have; unless a robot's number or the scenario says so, no drive has 0"""
+    """Node ids that a drive may have; planning gives 0 to a drive only if `by_number` is set or the scenario says so"""
     by_number: ClassVar[bool] = False
-    """True: a robot's number is the node id of its drives, and the scenario cannot choose another"""
+    """True: the node id of a robot's drives is the robot's number, and the scenario cannot choose another"""
     empty_asks: ClassVar[bool] = False
     """True: a frame without data asks for the frame with its identifier, as a remote frame does"""
 
@@ -44,61 +44,62 @@ class DriveProtocol(Plugin, ABC):
 
     @abstractmethod
     def identifiers(self, node: int) -> frozenset[int]:
-        """Returns the identifiers of the frames that a node alone sends or is sent, so that no two drives use one.
+        """Returns the identifiers of all frames from and to this node alone, the host's commands included.
 
-        The host's frames count too."""
+        Two drives on a bus must not share one of them."""
 
     def shared_identifiers(self) -> frozenset[int]:
         """Returns the identifiers that all drives of the protocol on a bus share."""
         return frozenset()
 
     def refuses(self, motor: MotorPlan) -> str:
-        """Returns what the protocol cannot say of a motor, beginning with the key: `rated_torque = 1e9: …`; empty if it can say
-        all."""
+        """Returns which value of a motor the protocol cannot express, beginning with its key: `rated_torque = 1e9: …`.
+
+        Returns "" if it can express all of them."""
         return ""
 
     def addresses(self, drive: DrivePlan) -> dict[str, dict[str, int]]:
-        """Returns how a host addresses a robot's drives, for people: its `nodes` by wheel, or its `identifiers` by kind."""
+        """Returns the addresses of a robot's drives for display: `nodes` by wheel, or `identifiers` by kind of frame."""
         return {"nodes": dict(zip(WHEELS, drive.node_ids, strict=True))}
 
-    # Who speaks and who listens
+    # Hosts, drives, observers
 
     @abstractmethod
     def host(self, drive: DrivePlan) -> Host:
-        """Returns what commands the drives of a robot."""
+        """Returns the host of a robot's drives."""
 
     @abstractmethod
     def drive(self, drive: DrivePlan, number: int) -> Drive:
-        """Returns one of a robot's virtual drives: that of the wheels `wheels[number]`."""
+        """Returns the virtual drive of the wheels `wheels[number]`."""
 
     @abstractmethod
     def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
-        """Returns what listens to a robot's frames.  Not `closed`: torque is mirrored and nobody answers."""
+        """Returns the observer of a robot's frames.  `closed` is false on the mirrored path, where no drive answers."""
 
     def master(self, period_ns: int, watchdog_ns: int) -> Master | None:
-        """Returns what a bus has one of, whatever the number of robots on it, if the protocol has that."""
+        """Returns the master of a bus, or None if the protocol has none."""
         return None
 
-    # What those who look at a bus need to know
+    # Descriptions of the frames
 
     @abstractmethod
     def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
-        """Returns the DBC messages of a robot's frames; `name` stands for the robot, a DBC identifier of up to 23 characters.
+        """Returns the DBC messages of a robot's frames.  `name` is the robot's name as a DBC identifier of up to 23 characters.
 
-        Each identifier that comes regularly has one: the load of a bus is computed from them."""
+        Each cyclic identifier must have a message, since the load of a bus is computed from them."""
 
     def shared_messages(self, period_ns: int, watchdog_ns: int) -> "list[Message]":
         """Returns the DBC messages of `shared_identifiers`."""
         return []
 
     def shared_cyclic(self, period_ns: int, watchdog_ns: int) -> dict[int, int]:
-        """Returns which of `shared_identifiers` come regularly, with their periods [ns]."""
+        """Returns the cyclic ones of `shared_identifiers` with their periods [ns]."""
         return {}
 
     def resolution(self, drive: DrivePlan) -> float:
-        """Returns the step of torques in the protocol's frames [N m]; 0 for floating point."""
+        """Returns the resolution of torques in the frames [N m per bit]; 0 for floating point."""
         return drive.torque_scale
 
     def boot_ups(self, drive: DrivePlan) -> Mapping[tuple[int, bytes], frozenset[int]]:
-        """Returns which cyclic identifiers begin anew with a frame, by that frame's identifier and data."""
+        """Returns boot-up messages, by identifier and data, with the cyclic identifiers that begin anew after them."""
         return {}

@@ -1,6 +1,6 @@
-"""The registry of drive protocols that are built in, and what the robots of a plan have of theirs.
+"""The registry of built-in drive protocols, and the hosts, drives, observers and masters of a plan.
 
-What a protocol makes that others wrote comes checked (bridge.protocols.checked).
+Those of users' own protocols are wrapped in checks (bridge.protocols.checked).
 """
 
 from collections.abc import Iterator
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
 
 PROTOCOLS: Final[dict[str, type[Plugin]]] = {"native": Native, "odrive": ODrive, "cia402": Cia402}
-"""What is built in, by name."""
+"""The built-in protocols by name."""
 DEFAULT: Final = "native"
-"""What robots have whose scenario names none."""
+"""The protocol of robots whose scenario names none."""
 
 
 def protocol_of(robot: RobotPlan) -> DriveProtocol:
@@ -32,7 +32,7 @@ def protocol_of(robot: RobotPlan) -> DriveProtocol:
 
 
 class DrivePlace(NamedTuple):
-    """Where a virtual drive is: its robot, the wheels (0 right, 1 left) whose motors it has, its bus, its node there."""
+    """The place of a virtual drive: its robot, its wheels (0 right, 1 left), its bus, and its node number there."""
 
     robot: int
     wheels: tuple[int, ...]
@@ -41,7 +41,7 @@ class DrivePlace(NamedTuple):
 
 
 def drive_places(plan: Plan) -> list[DrivePlace]:
-    """Lists the drives of a plan; their nodes are numbered from 1 on, after the bridge."""
+    """Returns the places of all drives of a plan; their nodes are numbered from 1 on, since the bridge is node 0."""
     places: list[DrivePlace] = []
     for robot in plan.robots:
         for wheels in protocol_of(robot).wheels:
@@ -50,34 +50,38 @@ def drive_places(plan: Plan) -> list[DrivePlace]:
 
 
 def make_host(robot: RobotPlan) -> Host:
-    """Returns what commands a robot's drives."""
+    """Returns the host of a robot's drives."""
     return protocol_of(robot).host(robot.drive) if robot.drive.protocol.is_own else CheckedHost(robot)
 
 
 def make_drive(plan: Plan, place: DrivePlace) -> Drive:
-    """Returns a virtual drive."""
+    """Returns the virtual drive at a place."""
     robot = plan.robots[place.robot]
     number = protocol_of(robot).wheels.index(place.wheels)
     return protocol_of(robot).drive(robot.drive, number) if robot.drive.protocol.is_own else CheckedDrive(robot, number)
 
 
 def make_observer(robot: RobotPlan, closed: bool) -> Observer:
-    """Returns what listens to a robot's frames; not `closed`: nobody answers."""
+    """Returns the observer of a robot's frames; `closed` is false on the mirrored path."""
     if robot.drive.protocol.is_own:
         return protocol_of(robot).observer(robot.drive, robot.envelope, closed)
     return CheckedObserver(robot, closed)
 
 
 def cyclic_of(robot: RobotPlan, observer: Observer, closed: bool) -> dict[int, int]:
-    """Returns which identifiers of a robot come regularly, with their periods [ns]: what the observer says, or where nobody
-    answers, torques alone, once per acceleration period."""
+    """Returns the cyclic identifiers of a robot with their periods [ns].
+
+    On the closed path these are the observer's.  On the mirrored path they are the torque commands, once per acceleration
+    period."""
     if closed:
         return observer.cyclic
     return {frame.can_id: robot.period_ns for frame in make_host(robot).mirror(0.0, 0.0, True)}
 
 
 class SharedProtocol(NamedTuple):
-    """A protocol that is spoken on a bus, as one of its robots there has it; times are the smallest of all robots there."""
+    """A protocol in use on a bus.
+
+    `part` is the protocol of the first robot that uses it there; `period_ns` is the smallest period of all robots there."""
 
     bus: int
     part: Part[Any]
@@ -92,7 +96,7 @@ class SharedProtocol(NamedTuple):
 
 
 def shared_protocols(plan: Plan) -> Iterator[SharedProtocol]:
-    """Yields the protocols that are spoken on each bus."""
+    """Yields the protocols in use on each bus."""
     for bus in range(len(plan.can.buses)):
         drives = [robot.drive for robot in plan.robots if robot.drive.bus == bus]
         for part in {drive.protocol.use: drive.protocol for drive in reversed(drives)}.values():
@@ -100,7 +104,7 @@ def shared_protocols(plan: Plan) -> Iterator[SharedProtocol]:
 
 
 def make_masters(plan: Plan) -> list[tuple[int, Master]]:
-    """Returns what a bus has one of, whatever the number of robots, with the number of the bus."""
+    """Returns the masters of all buses, each with the number of its bus."""
     found = []
     for one in shared_protocols(plan):
         if one.part.is_own:
@@ -113,7 +117,7 @@ def make_masters(plan: Plan) -> list[tuple[int, Master]]:
 
 
 def shared_cyclic(plan: Plan) -> list[tuple[int, int, int]]:
-    """Returns what comes regularly on buses without being a robot's: bus, identifier, period [ns]."""
+    """Returns the cyclic frames on buses that belong to no robot: bus, identifier, period [ns]."""
     return [
         (one.bus, can_id, period_ns)
         for one in shared_protocols(plan)
@@ -122,12 +126,12 @@ def shared_cyclic(plan: Plan) -> list[tuple[int, int, int]]:
 
 
 def dbc_messages(robot: RobotPlan, name: str) -> "list[Message]":
-    """Returns the DBC messages of a robot's frames; `name` stands for the robot."""
+    """Returns the DBC messages of a robot's frames; `name` is the robot's name in them."""
     return protocol_of(robot).messages(robot.drive, name)
 
 
 def shared_messages(plan: Plan, bus: int) -> "list[Message]":
-    """Returns the DBC messages of a bus that are no robot's."""
+    """Returns the DBC messages of a bus that belong to no robot."""
     return [
         message
         for one in shared_protocols(plan)

@@ -1,6 +1,6 @@
-"""Tries the protocols of a plan that others wrote, before anything starts: everything is made that a run will ask for.
+"""A trial of the users' own protocols in a plan, before a run starts.
 
-Raises PartRunError: one line that names file, class, robot and what is wrong.
+It makes every object that a run will need.  An error raises PartRunError: one line that names file, class, robot and the error.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,9 @@ from echelon.plan.plan import Plan, RobotPlan
 
 
 def try_protocols(plan: Plan) -> None:
-    """Makes hosts, drives, observers, masters and DBC messages of one robot for each protocol that others wrote."""
+    """Makes host, drives, observer, master and DBC messages of one robot for each user's own protocol.
+
+    Raises PartRunError for the first error."""
     others = {id(robot.drive.protocol): robot for robot in reversed(plan.robots) if not robot.drive.protocol.is_own}
     for robot in others.values():
         _try_robot(plan, robot)
@@ -62,13 +64,13 @@ def _messages(caller: Caller, what: str, function: Callable[..., Any], *argument
 
 
 def _check_described(caller: Caller, what: str, cyclic: set[int], messages: list[Any]) -> None:
-    """What comes regularly must have a DBC message: the load of a bus is computed from it."""
+    """Raises PartRunError if a cyclic identifier has no DBC message, from which the load of a bus is computed."""
     if lacking := sorted(cyclic - {message.frame_id for message in messages}):
         raise caller.wrong(f"{what}: identifier {lacking[0]:#05x} comes regularly, but `messages` does not describe it")
 
 
 def _check_addresses(caller: Caller, found: Any) -> None:
-    """Checks what is shown of where drives are."""
+    """Raises PartRunError unless `addresses` returned nodes or identifiers by name."""
     if not (
         isinstance(found, dict)
         and len(found) == 1

@@ -1,1 +1,1 @@
-"""A passive listener that holds frames against the plan."""
+"""A passive listener that compares the frames on the buses with the plan."""

@@ -1,18 +1,23 @@
-"""When cyclic frames are due on a bus, and which come late, early, or not at all.  Pure.
+"""When cyclic frames are due on a bus, and which of them come late, early or not at all.  Pure.
 
-A frame waits while others have the bus, and a full bus breaks no contract.  So a frame is only late by the time that the
-bus was free while it was due: from then to the beginning of the stretch of frames, one right after the other, that it is
-part of.  The next one is due a period after this one was.
+*Late.*  A frame may wait for a busy bus; that is not lateness.  A *busy stretch* is a sequence of frames without a free pause
+between them.  A frame is late by the time from its due instant to the beginning of the busy stretch that it is part of.
+The next frame is due a period after this one was due, or came if that was earlier.
 
-A frame that is missing shifts all later ones by a period.  On a busy bus only a part of that can be told from waiting, so
-five frames in a row that are late by 2 ms and an eighth of the period are a gap, too; nothing can be told of a bus that is
-never free for so long.  Pauses shorter than a frame and an error frame count as busy, for destroyed frames are not seen;
-where the plan has disturbances, pauses shorter than five of them, and frames in a row are not looked at.
+*Free pauses.*  The referee does not see destroyed frames.  So a pause shorter than a frame and an error frame counts as busy.
+If the plan has error frames, a pause shorter than five of them does.
 
-What may come early.  A sender that was held up may send what it owes at once, frames that follow each other within half a
-period, until one is due again; with the first that does not follow so it has caught up, and what has not come is lost.  A
-remote frame asks for one more as well, and a command for no torque may come at any time.  A drive that boots, and says so,
-begins anew.
+*Shifted.*  If a frame is missing, all later frames come a period late.  On a busy bus this looks like waiting.  So five frames
+in a row are also a gap if each of them is late by more than 2 ms and more than an eighth of the period.  This rule is off if
+the plan has error frames.  On a bus that is never free it finds nothing.
+
+*Early.*  A frame may be early in these cases:
+
+- its sender was delayed and catches up: it sends the frames that it owes at once, less than half a period apart.  Catching up
+  ends when a frame is due again, or with the first frame that comes later than that; frames still owed are lost then;
+- a remote frame asked for it;
+- it is a command for zero torque (the referee checks this);
+- its drive sent its boot-up message: its periods begin anew.
 """
 
 from collections.abc import Mapping
@@ -28,15 +33,15 @@ from echelon.plan.plan import Plan
 
 SHIFT_NS: Final = 2_000_000
 SHIFTED: Final = 5
-"""So many frames in a row that are later than this, and than an eighth of their period, are a gap, too"""
+"""SHIFTED frames in a row are a gap if each is late by more than SHIFT_NS and more than an eighth of the period"""
 DISTURBED: Final = 5
-"""So many frames in a row may be destroyed in a plan that wants disturbances"""
+"""How many frames in a row may be destroyed in a plan with error frames"""
 _ERROR_BITS: Final = 23
-"""Of the longest error frame and the pause after it"""
+"""Length of the longest error frame and the interframe space [bits]"""
 
 
-class Watch:
-    """One identifier: whose it is, its period (0: it comes as it likes), when it is due."""
+class Deadline:
+    """The deadline of one identifier: its robots, its period (0: it is not cyclic) and when its next frame is due."""
 
     __slots__ = (
         "_begin_ns",
@@ -72,26 +77,29 @@ class Watch:
         self.shift_ns = max(period_ns // 8, SHIFT_NS, tolerance_ns or 0)
         self.robots: tuple[WheelCheck, ...] = ()
         self.asked_empty = False
-        """A frame without data asks for one, as a remote frame does"""
+        """True: a frame without data asks for a frame, as a remote frame does"""
         self.frames = 0
         self.first_ns = 0
         self.due_ns: int | None = None
-        self.silent = False  # which was told
-        self._owed = 0  # frames that were asked for
-        self._catching_up = False  # it may send what it owes
-        self._begin_ns = 0  # of the last frame
-        self._shifted = self._shift_ns = 0  # how many frames in a row were late, by how much at least
-        self._last_ns: int | None = None  # in the run
-        self._gaps = self._sum = self._squares = 0  # of distances, less the first one's
+        self.silent = False  # silence was reported
+        self._owed = 0  # frames that remote frames asked for
+        self._catching_up = False  # the sender may send the frames that it owes
+        self._begin_ns = 0  # when the last frame began
+        self._shifted = self._shift_ns = 0  # number of frames in a row that were late, and their smallest lateness
+        self._last_ns: int | None = None  # the last frame from run time 0 on
+        # number, sum and sum of squares of the periods, each less the first period, so that the sums stay exact
+        self._gaps = self._sum = self._squares = 0
         self._first_gap_ns = self._shortest_ns = self._longest_ns = 0
 
     @property
     def robot(self) -> WheelCheck | None:
-        """Whose it is, if only one's."""
+        """The robot of this identifier; None if it is that of several or of none."""
         return self.robots[0] if len(self.robots) == 1 else None
 
     def take(self, time_ns: int, begin_ns: int, busy_ns: int, frame: Frame) -> tuple[str, str] | None:
-        """Takes a frame that began at `begin_ns`, in a stretch of frames that did at `busy_ns`; says if it is untimely."""
+        """Takes a frame that began at `begin_ns`, in a busy stretch that began at `busy_ns`.
+
+        Returns kind and text of a finding if the frame is early or late."""
         if not self.frames:
             self.first_ns = time_ns
         self.frames += 1
@@ -114,7 +122,7 @@ class Watch:
         late_ns, told = busy_ns - self.due_ns, None
         if self._catching_up and begin_ns - self.due_ns <= self.half_ns:
             self._catching_up = False
-        elif self._catching_up and begin_ns - last_ns > self.half_ns:  # what it owes and did not send is lost
+        elif self._catching_up and begin_ns - last_ns > self.half_ns:  # the frames that it still owes are lost
             self._catching_up = False
             periods = max(0, (busy_ns - self.due_ns + self.half_ns) // self.period_ns)
             self.due_ns = max(self.due_ns + periods * self.period_ns, busy_ns)
@@ -129,12 +137,12 @@ class Watch:
         return told
 
     def _follow(self, after_ns: int, late_ns: int) -> tuple[str, str] | None:
-        """Keeps `due_ns` with a sender whose clock is a little slower; says if the last frames were all late."""
+        """Moves `due_ns` with a sender whose clock is slightly slow.  Returns a finding if the last frames were all late."""
         assert self.due_ns is not None
         if after_ns <= self.shift_ns:
             self._shifted = 0
             self.due_ns += max(0, late_ns) // 8
-        elif late_ns > self.shift_ns:  # and not within a stretch, where nobody can tell
+        elif late_ns > self.shift_ns:  # a frame within a busy stretch says nothing: it may have waited
             self._shifted += 1
             self._shift_ns = late_ns if self._shifted == 1 else min(late_ns, self._shift_ns)
             if self._shifted == SHIFTED:
@@ -148,11 +156,11 @@ class Watch:
 
     @property
     def expected_ns(self) -> int | None:
-        """When the next one is due, or will be when the sender has caught up; None before the first."""
+        """When the next frame is due, or will be when the sender has caught up; None before the first frame."""
         return None if self.due_ns is None else max(self.due_ns, self._begin_ns + self.period_ns)
 
     def forget(self) -> None:
-        """Its sender begins anew."""
+        """Begins anew, since the sender has booted: the next frame may come at any time."""
         self.due_ns, self._last_ns, self._catching_up, self.silent = None, None, False, False
 
     def _measure(self, time_ns: int) -> None:
@@ -172,7 +180,7 @@ class Watch:
             self._longest_ns = gap_ns
 
     def report(self) -> TimingReport:
-        """Returns the frames in all, and the periods between those of the run."""
+        """Returns the number of frames, and statistics of the periods from run time 0 on."""
         count = self._gaps
         if not count:
             return TimingReport(self.frames)
@@ -186,8 +194,8 @@ class Watch:
         )
 
 
-class Lane:
-    """One bus: how long its frames take at most, when the present stretch of frames began, what to look for."""
+class BusTraffic:
+    """The traffic of one bus: lengths of its frames, the present busy stretch, and the deadlines of its identifiers."""
 
     def __init__(self, plan: Plan, bus: int) -> None:
         bit_ns = 0.0 if plan.can.closed and plan.can.timing == "ideal" else 1e9 / plan.can.buses[bus].bitrate
@@ -197,30 +205,30 @@ class Lane:
         self.last_ns = -NEVER_NS
         self.busy_ns = -NEVER_NS
         self.scan_ns = -NEVER_NS
-        self.watches: dict[int, Watch] = {}
+        self.deadlines: dict[int, Deadline] = {}
         """By identifier"""
-        self.boot_ups: dict[tuple[int, bytes], list[Watch]] = {}
-        """What begins anew with a frame, by its identifier and data"""
+        self.boot_ups: dict[tuple[int, bytes], list[Deadline]] = {}
+        """The deadlines that begin anew with a boot-up message, by its identifier and data"""
 
-    def add(self, can_id: int, period_ns: int, tolerance_ns: int | None = None) -> Watch:
-        """Returns the watch of an identifier, a new one if there is none; period 0: it comes as it likes."""
-        watch = self.watches.get(can_id)
-        if watch is None:
-            watch = self.watches[can_id] = Watch(can_id, period_ns, tolerance_ns)
+    def add(self, can_id: int, period_ns: int, tolerance_ns: int | None = None) -> Deadline:
+        """Returns the deadline of an identifier and makes it if it is new; `period_ns` 0 means that it is not cyclic."""
+        deadline = self.deadlines.get(can_id)
+        if deadline is None:
+            deadline = self.deadlines[can_id] = Deadline(can_id, period_ns, tolerance_ns)
             if self.disturbed:
-                watch.shift_ns = NEVER_NS
-        return watch
+                deadline.shift_ns = NEVER_NS
+        return deadline
 
     def add_boot_ups(self, boot_ups: Mapping[tuple[int, bytes], frozenset[int]]) -> None:
-        """Takes note of frames with which identifiers begin anew."""
+        """Adds boot-up messages, by identifier and data, with the identifiers whose deadlines begin anew with them."""
         for frame, can_ids in boot_ups.items():
-            self.boot_ups[frame] = [self.watches[can_id] for can_id in sorted(can_ids) if can_id in self.watches]
+            self.boot_ups[frame] = [self.deadlines[can_id] for can_id in sorted(can_ids) if can_id in self.deadlines]
 
     @property
     def first_ns(self) -> int | None:
-        """When the first known frame came."""
-        return min((watch.first_ns for watch in self.watches.values() if watch.frames), default=None)
+        """When the first frame with a known identifier came; None before."""
+        return min((deadline.first_ns for deadline in self.deadlines.values() if deadline.frames), default=None)
 
-    def cyclic(self) -> list[Watch]:
-        """Identifiers that must come regularly."""
-        return [watch for watch in self.watches.values() if watch.period_ns]
+    def cyclic(self) -> list[Deadline]:
+        """Returns the deadlines of cyclic identifiers."""
+        return [deadline for deadline in self.deadlines.values() if deadline.period_ns]

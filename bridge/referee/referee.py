@@ -1,24 +1,25 @@
-"""The referee: a passive listener to all buses of a plan, which sees nothing but frames and holds them against the plan.
+"""The referee: a passive listener to all buses of a plan, which compares the frames with the plan (docs/architecture.md, 5.7).
 
-What protocols ask for, their observers check (bridge.<protocol>.observe).  The referee adds what they share.  Kinds:
+The observer of a protocol (bridge.protocols.<protocol>.observe) checks what its protocol demands.  The referee checks what all
+protocols have in common:
 
-    time          a frame is older than the one before it on its bus
-    gap           a cyclic frame came more than half a period after it was due (or more than `tolerance_ns`)
-    silent        it did not come at all for a watchdog and a period, or at the end
-    missing       nothing at all came of an identifier, or of a robot
-    burst         a cyclic frame came more than half a period before it was due, and nothing was owed
-    torque above limit, rise above limit, fall above limit, window above limit
-                  commanded or reported, beyond the envelope by more than a bit; a command may be zero at any time
-    torque not commanded
-                  reported, but beyond all commands of the time in which they can have had an effect
-    torque before the run
-                  commanded or reported while drives are brought up, at negative times
+kind of finding                     meaning
+time                                a frame is older than the one before it on its bus
+gap                                 a cyclic frame began more than half a period (or `tolerance_ns`) after it was due
+silent                              a cyclic frame did not come for a watchdog and a period, or up to the end
+missing                             no frame came with a cyclic identifier, or from a robot
+burst                               a cyclic frame came more than half a period early, without a reason
+torque above limit                  a reported torque exceeds the envelope by more than a bit; observers check commands
+rise, fall or window above limit    a change of the commanded torque exceeds the envelope by more than a bit; a command may
+                                    go to zero at any time
+torque not commanded                a reported torque is outside all commands that may still have an effect
+torque before the run               a torque was commanded or reported before run time 0
 
-`bridge.referee.deadlines` says when frames are due.  A frame that waits for the bus is not late, and no frame is late while
-drives are brought up.  For the same reason feedback may be as old as the stretch of frames that it came in.
+`bridge.referee.deadlines` says when frames are due.  A frame that waits for the bus is not late, and no frame is late before
+run time 0.  Feedback may have waited for the bus, too: it may be as old as the busy stretch that it came in.
 
-Identifiers that no robot of the plan uses are foreign traffic, which is legal: counted, not judged.  Where the torque path
-is not closed there are torques alone, one per acceleration period, and nobody answers.
+Frames with identifiers that no robot of the plan uses are counted but not judged.  On the mirrored path there are only torque
+commands, one per acceleration period.
 """
 
 from collections import Counter
@@ -30,26 +31,26 @@ from echelon.bridge.can.canlog import Logged, read_log
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.observe import Finding, Observer
 from echelon.bridge.protocols.registry import protocol_of, shared_cyclic
-from echelon.bridge.referee.deadlines import Lane
+from echelon.bridge.referee.deadlines import BusTraffic
 from echelon.bridge.referee.wheel_check import WheelCheck
 from echelon.bridge.reports import FindingReport, RefereeReport
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 
 KEPT: Final = 100
-"""Findings that a report holds in full"""
+"""How many findings a report holds in full"""
 WAIT_NS: Final = 1_000_000_000
-"""Feedback is taken to have waited for the bus no longer than this"""
+"""The longest time that feedback is assumed to wait for the bus"""
 SCAN_NS: Final = 50_000_000
-"""How often it is looked for identifiers that are silent"""
+"""The interval of the search for silent identifiers"""
 
 
 class Referee:
-    """Listens to the buses of a plan.  Times are run times [ns]; times below zero are the bringing up of drives.
+    """Listens to the buses of a plan.  Times are run times [ns], negative while drives are brought up.
 
-    `tolerance_ns` is how late a cyclic frame may be, half its period unless given, and how early if that is more; live,
-    where processes wait for their turn, give more.  Raises ValueError for a negative one.  `late`: drives may have been
-    enabled before anybody listened.
+    `tolerance_ns` is how late a cyclic frame may be; None means half its period.  A frame may be early by the larger of both.
+    A referee that listens live needs more tolerance, since processes wait for a processor.  `late` says that the drives may
+    have been enabled before the referee began to listen.  Raises ValueError for a negative tolerance.
     """
 
     def __init__(self, plan: Plan, *, tolerance_ns: int | None = None, late: bool = False) -> None:
@@ -58,66 +59,67 @@ class Referee:
         self.plan = plan
         self.frames = 0
         self.unknown = 0
-        """Frames with identifiers that no robot of the plan uses"""
+        """Number of frames with identifiers that no robot of the plan uses"""
         self.kinds: Counter[str] = Counter()
+        """Number of findings by kind"""
         self.kept: list[FindingReport] = []
         """The first findings"""
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
         self._late = late
         self._silence_ns = plan.can.watchdog_ns
-        self._lanes = [Lane(plan, bus) for bus in range(len(plan.can.buses))]
+        self._buses = [BusTraffic(plan, bus) for bus in range(len(plan.can.buses))]
         for robot in self.robots:
-            lane = self._lanes[robot.plan.drive.bus]
+            traffic = self._buses[robot.plan.drive.bus]
             for can_id in sorted(robot.observer.identifiers):
-                watch = lane.add(can_id, robot.cyclic.get(can_id, 0), tolerance_ns)
-                watch.robots += (robot,)
-                watch.asked_empty = plan.can.closed and protocol_of(robot.plan).empty_asks
+                deadline = traffic.add(can_id, robot.cyclic.get(can_id, 0), tolerance_ns)
+                deadline.robots += (robot,)
+                deadline.asked_empty = plan.can.closed and protocol_of(robot.plan).empty_asks
         if plan.can.closed:
             for bus, can_id, period_ns in shared_cyclic(plan):
-                self._lanes[bus].add(can_id, period_ns, tolerance_ns)
+                self._buses[bus].add(can_id, period_ns, tolerance_ns)
             for robot in self.robots:
-                self._lanes[robot.plan.drive.bus].add_boot_ups(protocol_of(robot.plan).boot_ups(robot.plan.drive))
+                self._buses[robot.plan.drive.bus].add_boot_ups(protocol_of(robot.plan).boot_ups(robot.plan.drive))
 
     @property
     def observers(self) -> list[Observer]:
-        """The robots' observers, by number."""
+        """The observers of all robots, by the robots' numbers."""
         return [robot.observer for robot in self.robots]
 
     def observe(self, time_ns: int, bus: int, frame: Frame) -> list[Finding]:
-        """Takes a frame of bus number `bus`; returns what is wrong with it, or shows by its time to be missing.
+        """Takes a frame of bus number `bus`; returns the findings: faults of the frame, and identifiers that are silent by now.
 
         Raises ValueError for a bus that the plan does not have."""
-        if not 0 <= bus < len(self._lanes):
-            raise ValueError(f"bus must be 0 .. {len(self._lanes) - 1}, not {bus!r}")
-        lane = self._lanes[bus]
+        if not 0 <= bus < len(self._buses):
+            raise ValueError(f"bus must be 0 .. {len(self._buses) - 1}, not {bus!r}")
+        traffic = self._buses[bus]
         self.frames += 1
         said: list[Finding] = []
-        if time_ns < lane.last_ns:
-            text = f"{(lane.last_ns - time_ns) / 1e6:g} ms before the frame before it"
+        if time_ns < traffic.last_ns:
+            text = f"{(traffic.last_ns - time_ns) / 1e6:g} ms before the frame before it"
             said.append(self._tell(bus, None, Finding(time_ns, frame.can_id, "time", text)))
-            time_ns = lane.last_ns
-        begin_ns = time_ns - lane.durations_ns[min(len(frame.data), 8)]
-        if begin_ns > lane.last_ns + lane.pause_ns:
-            lane.busy_ns = begin_ns
-        lane.last_ns = time_ns
-        if time_ns >= lane.scan_ns:
-            lane.scan_ns = time_ns + SCAN_NS
+            time_ns = traffic.last_ns
+        begin_ns = time_ns - traffic.durations_ns[min(len(frame.data), 8)]
+        if begin_ns > traffic.last_ns + traffic.pause_ns:
+            traffic.busy_ns = begin_ns
+        traffic.last_ns = time_ns
+        if time_ns >= traffic.scan_ns:
+            traffic.scan_ns = time_ns + SCAN_NS
             if time_ns >= 0:
                 said += self._scan(time_ns, bus, frame.can_id)
-        watch = lane.watches.get(frame.can_id)
-        if watch is None:
+        deadline = traffic.deadlines.get(frame.can_id)
+        if deadline is None:
             self.unknown += 1
             return said
-        untimely = watch.take(time_ns, begin_ns, lane.busy_ns, frame)
-        if lane.boot_ups and (anew := lane.boot_ups.get((frame.can_id, frame.data))):
+        untimely = deadline.take(time_ns, begin_ns, traffic.busy_ns, frame)
+        if traffic.boot_ups and (anew := traffic.boot_ups.get((frame.can_id, frame.data))):
             untimely = None
             for other in anew:
                 other.forget()
-        sampled_ns = max(lane.busy_ns, time_ns - WAIT_NS)
-        for robot in watch.robots:
+        sampled_ns = max(traffic.busy_ns, time_ns - WAIT_NS)
+        for robot in deadline.robots:
             found = robot.observer.observe(time_ns, frame)
             for finding in found:
-                unheard = self._late and watch.frames == 1 and finding.kind == "enabled unasked"
+                unheard = self._late and deadline.frames == 1 and finding.kind == "enabled unasked"
                 waited = finding.kind == "torque after silence" and not robot.silent(sampled_ns)
                 if not unheard and not waited:
                     said.append(self._tell(bus, robot, finding))
@@ -128,35 +130,42 @@ class Referee:
                 if not any(finding.kind == kind for finding in found):
                     said.append(self._tell(bus, robot, Finding(time_ns, frame.can_id, kind, text)))
         if untimely is not None and time_ns >= 0:
-            said.append(self._tell(bus, watch.robot, Finding(time_ns, frame.can_id, *untimely)))
+            said.append(self._tell(bus, deadline.robot, Finding(time_ns, frame.can_id, *untimely)))
         return said
 
     def finish(self, time_ns: int) -> list[Finding]:
-        """Ends it; returns which identifiers were silent at `time_ns`, or missing all the time."""
+        """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came."""
         said: list[Finding] = []
-        time_ns = max(time_ns, *(lane.last_ns for lane in self._lanes))
-        for lane in self._lanes:
-            if time_ns > lane.last_ns + lane.pause_ns:
-                lane.busy_ns = time_ns
-        begin_ns = min((lane.first_ns for lane in self._lanes if lane.first_ns is not None), default=-NEVER_NS)
-        for bus, lane in enumerate(self._lanes):
+        time_ns = max(time_ns, *(traffic.last_ns for traffic in self._buses))
+        for traffic in self._buses:
+            if time_ns > traffic.last_ns + traffic.pause_ns:
+                traffic.busy_ns = time_ns
+        begin_ns = min((traffic.first_ns for traffic in self._buses if traffic.first_ns is not None), default=-NEVER_NS)
+        for bus, traffic in enumerate(self._buses):
             said += self._scan(time_ns, bus, ended=True)
             unheard = {robot.name for robot in self.robots if robot.plan.drive.bus == bus} - {
-                robot.name for watch in lane.watches.values() if watch.frames for robot in watch.robots[:1]
+                robot.name
+                for deadline in traffic.deadlines.values()
+                if deadline.frames
+                for robot in deadline.robots[:1]
             }
-            for watch in lane.watches.values():
-                if not watch.period_ns or watch.frames or time_ns - begin_ns < 2 * watch.period_ns + watch.half_ns:
+            for deadline in traffic.deadlines.values():
+                if (
+                    not deadline.period_ns
+                    or deadline.frames
+                    or time_ns - begin_ns < 2 * deadline.period_ns + deadline.half_ns
+                ):
                     continue
-                robot, text = watch.robot, "never came"
+                robot, text = deadline.robot, "never came"
                 if robot is not None and robot.name in unheard:
-                    if watch.can_id != min(robot.cyclic):
+                    if deadline.can_id != min(robot.cyclic):
                         continue
                     text = "nothing came, of this identifier or any other of the robot's"
-                said.append(self._tell(bus, robot, Finding(time_ns, watch.can_id, "missing", text)))
+                said.append(self._tell(bus, robot, Finding(time_ns, deadline.can_id, "missing", text)))
         return said
 
     def report(self, source: str = "can.log") -> RefereeReport:
-        """Returns what was seen and found; `source` is what it listened to."""
+        """Returns the report; `source` says where the frames came from: `can.log`, or `bus`."""
         names = [bus.name for bus in self.plan.can.buses]
         return RefereeReport(
             frames=self.frames,
@@ -164,29 +173,30 @@ class Referee:
             kinds=dict(sorted(self.kinds.items())),
             findings=tuple(self.kept),
             identifiers={
-                f"{name}:{watch.can_id:03X}": watch.report()
-                for name, lane in zip(names, self._lanes, strict=True)
-                for watch in sorted(lane.watches.values(), key=lambda watch: watch.can_id)
-                if watch.frames
+                f"{name}:{deadline.can_id:03X}": deadline.report()
+                for name, traffic in zip(names, self._buses, strict=True)
+                for deadline in sorted(traffic.deadlines.values(), key=lambda deadline: deadline.can_id)
+                if deadline.frames
             },
             source=source,
         )
 
     def _scan(self, time_ns: int, bus: int, can_id: int | None = None, ended: bool = False) -> Iterator[Finding]:
-        """Tells which cyclic identifiers are silent, but for the one that has just come."""
-        lane = self._lanes[bus]
-        for watch in lane.cyclic():
-            expected_ns = watch.expected_ns
-            if expected_ns is None or watch.silent or watch.can_id == can_id:
+        """Yields a finding for each cyclic identifier that has fallen silent, except `can_id`, which has just come."""
+        traffic = self._buses[bus]
+        for deadline in traffic.cyclic():
+            expected_ns = deadline.expected_ns
+            if expected_ns is None or deadline.silent or deadline.can_id == can_id:
                 continue
-            tolerance_ns = watch.tolerance_ns
+            tolerance_ns = deadline.tolerance_ns
             if not ended:
-                tolerance_ns = max(tolerance_ns, self._silence_ns + watch.period_ns)
-            late_ns = lane.busy_ns - expected_ns
+                tolerance_ns = max(tolerance_ns, self._silence_ns + deadline.period_ns)
+            late_ns = traffic.busy_ns - expected_ns
             if late_ns > tolerance_ns:
-                watch.silent = True
-                text = f"nothing for {(late_ns + watch.period_ns) / 1e6:.4g} ms, its period is {watch.period_ns / 1e6:g} ms"
-                yield self._tell(bus, watch.robot, Finding(time_ns, watch.can_id, "silent", text))
+                deadline.silent = True
+                period_ns = deadline.period_ns
+                text = f"nothing for {(late_ns + period_ns) / 1e6:.4g} ms, its period is {period_ns / 1e6:g} ms"
+                yield self._tell(bus, deadline.robot, Finding(time_ns, deadline.can_id, "silent", text))
 
     def _tell(self, bus: int, robot: WheelCheck | None, finding: Finding) -> Finding:
         self.kinds[finding.kind] += 1
@@ -205,9 +215,10 @@ class Referee:
 
 
 def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> RefereeReport:
-    """Returns the referee's report on a run's can.log.  One that ends before the run should is silence, if it is `whole`.
+    """Returns the referee's report on the can.log of a run.
 
-    Raises OSError if it cannot be read."""
+    `whole` says that the run was not cut off: then cyclic frames that are missing at the end of the log are silence.
+    Raises OSError if the log cannot be read."""
     referee = Referee(plan, tolerance_ns=tolerance_ns)
     last_ns = 0
     for time_ns, bus, frame in read_run_log(path, plan):
@@ -218,12 +229,12 @@ def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole:
 
 
 def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:
-    """Yields run time [ns], number of the bus and frame from a run's can.log; buses that the plan lacks are passed over."""
+    """Yields run time [ns], number of the bus and frame from a run's can.log; skips buses that the plan does not have."""
     return of_run(read_log(path), plan)
 
 
 def of_run(logged: Iterable[Logged], plan: Plan) -> Iterator[tuple[int, int, Frame]]:
-    """Yields run time [ns], number of the bus and frame of what is in a run's can.log."""
+    """Yields run time [ns], number of the bus and frame of logged frames; skips buses that the plan does not have."""
     numbers = {bus.name: number for number, bus in enumerate(plan.can.buses)}
     start_ns = plan.can.bring_up_ns if plan.can.closed else 0
     for time_ns, channel, frame in logged:

@@ -1,6 +1,7 @@
-"""What a referee checks of a robot's torques, whatever the protocol: commands against the envelope, reports against both.
+"""The referee's checks of a robot's torques, the same for every protocol.  Pure.
 
-Kinds of findings are those of bridge.referee.referee.  Pure.
+Commands are compared with the envelope; reported torques are compared with the envelope and with the commands.  The kinds of
+findings are listed in bridge.referee.referee.
 """
 
 from collections import deque
@@ -15,7 +16,7 @@ _WINDOW_NS: Final = 250_000_000
 
 
 class WheelCheck:
-    """One robot: its observer, and what its wheels were last asked for; drives may be late by `late_ns`."""
+    """One robot: its observer and the last commands to its wheels.  Drives may react late by `late_ns`."""
 
     def __init__(self, plan: Plan, robot: RobotPlan, late_ns: int = 0) -> None:
         self.plan = robot
@@ -28,20 +29,22 @@ class WheelCheck:
         slew_ns = 2e9 * motor.torque_limit / motor.torque_slew
         self._effect_ns = drive.watchdog_ns + 2 * drive.period_ns + round(1e10 * motor.lag + slew_ns) + late_ns
         self._wheels = [Commands(self._effect_ns) for _ in WHEELS]
-        # Frames wait for the bus: of two that are further apart here the envelope may have seen the first no more.
+        # Frames wait for the bus.  So this window is shorter than the envelope's 250 ms by the longest wait: two frames within
+        # it were within the envelope's window, too.
         window_ns = _WINDOW_NS - 2 * drive.period_ns - late_ns
         self._windows = [Extremes(window_ns) for _ in WHEELS] if self.envelope.window_limit < inf else []
         self._begin_ns: int | None = None
 
     def silent(self, time_ns: int) -> bool:
-        """True if at this time some wheel had no command for its watchdog and a period."""
+        """Returns whether at this time some wheel has had no command for its watchdog and a period."""
         wait_ns = self.plan.drive.watchdog_ns + self.plan.drive.period_ns
         commanded = [wheel.commanded_ns for wheel in self._wheels]
         return any(time_ns - (self._begin_ns or 0 if at is None else at) > wait_ns for at in commanded)
 
     def check(self, time_ns: int, sampled_ns: int) -> tuple[list[tuple[str, str]], bool]:
-        """Looks at what the frame that the observer has just taken said of the wheels, in a report that was made at
-        `sampled_ns` at the earliest; returns what is wrong, and whether it was a command for no torque."""
+        """Checks the frame that the observer has just taken.  A report in it was made at `sampled_ns` at the earliest.
+
+        Returns kind and text of each finding, and whether the frame was a command for zero torque."""
         said: list[tuple[str, str]] = []
         stops = False
         if self._begin_ns is None:
@@ -65,7 +68,7 @@ class WheelCheck:
         rise, fall = self.envelope.rise_limit, self.envelope.fall_limit
         if before is None or not torque or rise == fall == inf:
             return
-        # what both have in common: the torque falls to it, then rises from it
+        # the torque falls to the common part of both, then rises from there; it is 0 if the sign changes
         common = max(0.0, min(torque, before), min(-torque, -before))
         if abs(torque) - common > rise * 1.000001 + self._bit:
             said.append(("rise above limit", f"{name}: from {before:g} to {torque:g} N m, by at most {rise:g}"))
@@ -76,7 +79,7 @@ class WheelCheck:
         self, time_ns: int, name: str, window: "Extremes", torque: float, said: list[tuple[str, str]]
     ) -> None:
         if not torque:
-            window.forget()  # the gate may go to zero from anywhere, and begins anew from there
+            window.forget()  # the envelope may go to zero from anywhere, and its window begins anew there
         window.add(time_ns, torque)
         least, most = window.range(time_ns)
         spread, limit = most - least, self.envelope.window_limit
@@ -97,7 +100,9 @@ class WheelCheck:
             said.append(("torque above limit", f"{name}: reported {torque:g} N m"))
         if time_ns < 0 and abs(torque) > self._bit + 1e-6:
             said.append(("torque before the run", f"{name}: reported {torque:g} N m"))
-        if sampled_ns - self._begin_ns > self._effect_ns:  # who begins to listen does not know what was before
+        if (
+            sampled_ns - self._begin_ns > self._effect_ns
+        ):  # before, a command that was not heard may still have an effect
             least, most = commands.range(sampled_ns)
             room = self._bit + 1e-6 + 1e-5 * max(-least, most)
             if not least - room <= torque <= most + room:
@@ -106,12 +111,12 @@ class WheelCheck:
 
 
 class Extremes:
-    """The smallest and the largest torque [N m] that one wheel was asked for in a stretch of time."""
+    """The smallest and the largest torque [N m] that one wheel was commanded within the last `length_ns`."""
 
     def __init__(self, length_ns: int) -> None:
         self._length_ns = length_ns
-        self._highs: deque[tuple[int, float]] = deque()  # each less than those before it
-        self._lows: deque[tuple[int, float]] = deque()  # likewise, negated
+        self._highs: deque[tuple[int, float]] = deque()  # falling values: the first is the largest in the window
+        self._lows: deque[tuple[int, float]] = deque()  # the same for negated torques
 
     def add(self, time_ns: int, torque: float) -> None:
         """Takes a torque."""
@@ -121,20 +126,20 @@ class Extremes:
             window.append((time_ns, value))
 
     def range(self, time_ns: int) -> tuple[float, float]:
-        """Returns both for the stretch that ends at a time; zeros if there was no torque in it."""
+        """Returns the smallest and the largest torque of the window that ends at a time; zeros if it holds none."""
         for window in (self._highs, self._lows):
             while window and window[0][0] < time_ns - self._length_ns:
                 window.popleft()
         return (-self._lows[0][1], self._highs[0][1]) if self._highs else (0.0, 0.0)
 
     def forget(self) -> None:
-        """Begins anew."""
+        """Empties the window."""
         self._highs.clear()
         self._lows.clear()
 
 
 class Commands:
-    """What one wheel was asked for in the time that may still have an effect."""
+    """The commands to one wheel that may still have an effect: those of the last `effect_ns`."""
 
     def __init__(self, effect_ns: int) -> None:
         self.commanded_ns: int | None = None
@@ -148,6 +153,6 @@ class Commands:
         self._extremes.add(time_ns, torque)
 
     def range(self, time_ns: int) -> tuple[float, float]:
-        """Returns the smallest and the largest torque that may still have an effect; zero always may."""
+        """Returns the smallest and the largest torque that may still have an effect; zero is always between them."""
         least, most = self._extremes.range(time_ns)
         return min(0.0, least), max(0.0, most)

@@ -1,1 +1,1 @@
-"""The bridge and the drives as roles, and the gate before the bus."""
+"""The bridge and the virtual drives as roles, and the envelope."""

@@ -1,11 +1,14 @@
-"""The bridge on the closed torque path, as a role: robots' torques in, frames out; feedback in, wheel torques out.
+"""The bridge on the closed torque path, as a role (docs/architecture.md, 5.2).
 
-Twice per torque period it has its turn.  First it hears what the drives fed back at this instant, and tells robots the
-torques that their wheels had in the period that ends.  Then it takes the robots' new torques through the envelope, lets
-the hosts make frames of them, and lets the bus carry what it can in the period (bridge.timing.arbitration): that is what the
-drives hear, each frame at its instant.
+It has two stages in each torque period:
 
-Feedback is a sample of its instant: the plant, which is not on the bus, takes it without the time it spends there.
+stage    what it does
+hear     takes the drives' feedback of this instant; tells the robots the torques of their wheels in the period that ends
+send     puts the robots' new torques through the envelope, has the hosts make frames of them, and lets the models of the
+         buses carry them until the next period; tells the drives each frame with its instant
+
+Feedback is a sample of its instant.  The plant uses it without the time that the frame spends on the bus, since the shaft of
+a motor needs no bus.
 """
 
 from collections import Counter
@@ -19,7 +22,7 @@ from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.protocols.registry import drive_places, make_host, make_masters
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.envelope import Envelope
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.bridge.timing.bus_model import BusEventKind
 from echelon.bridge.timing.buses import make_buses
@@ -35,16 +38,17 @@ from echelon.runtime.turns import Turn
 _COMMANDED: Final = TORQUE_FIELDS.index("commanded")
 _SATURATED: Final = TORQUE_FIELDS.index("saturated")
 NOT_COMMANDED: Final = "no command"
-"""Why a torque is zero besides the reasons of the envelope: the robot said it has none, or nothing (fresh) came from it."""
+"""The reason for a zero torque if the robot had no command, or if no fresh torque came from it.  All other reasons are the
+envelope's."""
 
 
 def _fresh(message: Heard, time_ns: int) -> list[TimedFrame]:
-    """Returns the frames of a message of this instant; a receiver holds an older one when nothing newer comes."""
+    """Returns the frames of a message of this instant, none of an older message (which is held if nothing newer comes)."""
     return [] if message is None or message.time_ns != time_ns else unpack(message.values)
 
 
 class RobotChannel:
-    """The way of one robot's torques to its drives: envelope, then host; counts what it stopped, and why."""
+    """The path of one robot's torques to its drives: envelope, then host.  Counts stopped torques by reason."""
 
     def __init__(self, robot: RobotPlan) -> None:
         self.robot = robot
@@ -53,29 +57,29 @@ class RobotChannel:
         self.stopped: Counter[str] = Counter()
         self.commands = 0
         self.largest = 0.0
-        self._gave = False
+        self._was_enabled = False
         self._came_up_ns: int | None = None
         self.spoken = False
-        """True once the robot has said something"""
+        """True once a message of the robot has come"""
         self.torque_frames = 0
-        """So many of the last cycle's frames, the last ones, carry its torques"""
+        """How many of the last cycle's frames carry torques; they are the last ones of the cycle"""
 
     def frames(self, time_ns: int, heard: Heard) -> list[Frame]:
-        """Returns the frames of one cycle: what the host has to say, and torques, which are zero if none may pass."""
+        """Returns the frames of one cycle: those of the host's `poll`, then torques, which are zero if none may pass."""
         host = self.host
         frames = host.poll(time_ns)
-        # What a host sends first when drives take torque (again) is zero, whatever is wanted; limits count from there.
+        # The first torque that a host sends to enabled drives is zero; the limits of the envelope count from there.
         enabled = host.enabled
-        gives, self._gave = enabled and self._gave, enabled
+        takes_torque, self._was_enabled = enabled and self._was_enabled, enabled
         if enabled and self._came_up_ns is None:
             self._came_up_ns = time_ns
         tau_right = tau_left = 0.0
         limited = False
         if heard is None or (values := heard.values.tolist())[_COMMANDED] != 1.0:
             self.envelope.stop(time_ns)
-            if self.spoken or time_ns >= self.robot.drive.watchdog_ns:  # a run begins with nothing said yet
+            if self.spoken or time_ns >= self.robot.drive.watchdog_ns:  # no robot has spoken yet when a run begins
                 self.stopped[NOT_COMMANDED] += 1
-        elif not gives:
+        elif not takes_torque:
             self.envelope.stop(time_ns)
         else:
             tau_right, tau_left, reason = self.envelope.check(time_ns, heard.time_ns, values[0], values[1])
@@ -91,15 +95,17 @@ class RobotChannel:
         return frames + commands if frames else commands
 
     def wheel_torques(self, time_ns: int) -> tuple[float, float]:
-        """Returns what the drives last reported [N m], zeros if that is older than their watchdog."""
+        """Returns the last reported torques [N m]; zeros if the report is older than the watchdog."""
         reported_ns = self.host.torque_ns
         if reported_ns is None or time_ns - reported_ns > self.robot.drive.watchdog_ns:
             return 0.0, 0.0
         return self.host.torque
 
     def stop(self, time_ns: int) -> tuple[list[Frame], str]:
-        """Returns frames that take the torque away and disable the drives.  If the host of somebody else's protocol fails at
-        that, they only ask for no torque, as far as it can say that; and the text says what failed."""
+        """Returns frames that take the torque away and disable the drives, and a text that says what failed.
+
+        If the host of a user's own protocol fails at `stop`, the frames only command zero torque; if `mirror` fails, too, there
+        are none.  The text is empty if nothing failed."""
         try:
             return self.host.stop(time_ns), ""
         except PartRunError as error:
@@ -107,10 +113,10 @@ class RobotChannel:
         try:
             return self.host.mirror(0.0, 0.0, False), failure
         except PartRunError:
-            return [], failure  # the drives' own watchdogs are left
+            return [], failure  # now only the drives' own watchdogs take the torque away
 
     def report(self) -> WheelsReport:
-        """Returns the counts."""
+        """Returns the report of this robot."""
         return WheelsReport(
             protocol=self.robot.drive.protocol.use,
             commands=self.commands,
@@ -126,7 +132,7 @@ class RobotChannel:
 class Commander:
     """The bridge's role in a plan with a closed torque path.
 
-    Its models of the buses have the drives' controllers in them too, unless `alone`."""
+    `alone`: its models of the buses do not contain the drives' CAN controllers, which another process models."""
 
     def __init__(self, plan: Plan, *, alone: bool = False) -> None:
         bridge = plan.bridge
@@ -135,9 +141,9 @@ class Commander:
         self._first_ns = bridge.first_ns
         self._period_ns = bridge.period_ns
         self.next_ns = bridge.first_ns
-        """End of the last period that frames were made for"""
+        """End of the last period for which frames were made"""
         self.robots = [RobotChannel(robot) for robot in plan.robots]
-        self.buses: list[BusTime | IdealBus] = make_buses(plan)
+        self.buses: list[ArbitratedBus | IdealBus] = make_buses(plan)
         self._listeners: list[dict[int, Host]] = [{} for _ in self.buses]
         for robot in self.robots:
             listeners = self._listeners[robot.robot.drive.bus]
@@ -147,12 +153,12 @@ class Commander:
         self._places = drive_places(plan)
         self._estops = Schedule(event for event in plan.events if event.kind == "estop")
         self._stopped: set[int] = set()
-        """Robots under an e-stop"""
+        """Numbers of the robots under an e-stop"""
         self._disturbances = Disturbances(plan, self.buses, drives=not alone)
-        self._told = [0] * len(self.buses)
-        """How many events of each bus drives have been told of"""
+        self._marked_events = [0] * len(self.buses)
+        """For each bus, the number of its events that `_marks` has already returned"""
         self.refused: Counter[str] = Counter()
-        """What came as messages and cannot be"""
+        """Impossible frames in messages, counted by reason"""
         reports = () if plan.drives is None else (Input(plan.drives.index, Channel.FRAMES),)
         torques = tuple(Input(robot.index, Channel.TORQUE) for robot in plan.robots)
         self.stages = (
@@ -161,7 +167,7 @@ class Commander:
         )
 
     def _hear(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Takes the drives' frames of this instant; returns the torques of all wheels in the period that ends."""
+        """The stage hear: takes the drives' frames of this instant; returns the torques of all wheels."""
         for message in heard:
             for at_ns, bus, node, frame in _fresh(message, time_ns):
                 if at_ns != time_ns or bus >= len(self.buses):
@@ -179,12 +185,12 @@ class Commander:
             host.receive(time_ns, frame)
 
     def wheels(self, time_ns: int) -> Message:
-        """Returns the torques of all wheels as last reported."""
+        """Returns the message with the last reported torques of all wheels [N m]."""
         torques = [torque for robot in self.robots for torque in robot.wheel_torques(time_ns)]
         return Message(Channel.WHEELS, self.index, time_ns // self._period_ns, time_ns, np.array(torques))
 
     def _send(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Puts the frames of this cycle on the bus; returns all frames that the buses carry until the next one."""
+        """The stage send: puts the frames of this cycle on the buses; returns all frames that they carry until the next."""
         self.next_ns = time_ns + self._period_ns
         for bus, frames in self.apply_events(time_ns):
             self._queue(time_ns, bus, frames)
@@ -197,7 +203,7 @@ class Commander:
         for bus, master in self._masters:
             if (sync := master.sync()) is None:
                 continue
-            # It ends with the period, so that all drives sample then, even if another frame has just begun.
+            # SYNC must end by the end of the period, when all drives sample, even if another frame has just begun.
             model = self.buses[bus]
             lead_ns = model.duration_ns(sync) + (0 if isinstance(model, IdealBus) else self._longest_ns[bus])
             self._queue(max(time_ns, end_ns - lead_ns), bus, [sync])
@@ -212,7 +218,7 @@ class Commander:
         return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(emptied + carried)),)
 
     def _empty_queues(self, time_ns: int) -> list[TimedFrame]:
-        """Loses what controllers that are off their bus still held: it must not come when it is old.  Tells the drives."""
+        """Empties the queues of nodes that are bus-off, so that no old frame is sent later; returns the marks of the drives."""
         emptied = []
         for number, bus in enumerate(self.buses):
             if bus.is_off(BRIDGE_NODE):
@@ -224,18 +230,18 @@ class Commander:
         return emptied
 
     def _marks(self) -> list[TimedFrame]:
-        """Returns which drives' controllers left their bus or came back, since this was last asked for."""
+        """Returns marks for the drives that went bus-off or came back since the last call."""
         marks = []
         for number, bus in enumerate(self.buses):
-            for time_ns, node, kind, _ in bus.events[self._told[number] :]:
+            for time_ns, node, kind, _ in bus.events[self._marked_events[number] :]:
                 mark = {BusEventKind.OFF: OFF, BusEventKind.RECOVERED: BACK}.get(kind)
                 if mark is not None and node != BRIDGE_NODE:
                     marks.append(TimedFrame(time_ns, NO_BUS, node, mark))
-            self._told[number] = len(bus.events)
+            self._marked_events[number] = len(bus.events)
         return marks
 
     def bus_frames(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
-        """Returns, bus by bus, what is sent once per period whatever robots there are; on a wall clock, at its start."""
+        """Returns for a wall clock the frames that a bus carries once per period, with its number: SYNC and heartbeats."""
         frames = []
         for bus, master in self._masters:
             sync = master.sync()
@@ -243,26 +249,26 @@ class Commander:
         return frames
 
     def reported_since(self, time_ns: int) -> bool:
-        """True if every robot's drives have reported their torques since an instant."""
+        """Returns whether the drives of every robot have reported their torques since an instant."""
         return all(robot.host.torque_ns is not None and robot.host.torque_ns >= time_ns for robot in self.robots)
 
     def _queue(self, time_ns: int, bus: int, frames: list[Frame]) -> None:
         for frame in frames:
-            self.buses[bus].send(time_ns, BRIDGE_NODE, frame)  # what finds no room is counted there
+            self.buses[bus].send(time_ns, BRIDGE_NODE, frame)  # the model counts a frame that finds its queue full
 
     def stop(self, time_ns: int) -> tuple[list[TimedFrame], str]:
-        """Returns frames that take the torque away from all wheels and disable their drives; and what failed, if anything."""
+        """Returns frames that take the torque away from all wheels and disable their drives, and the first failure's text."""
         stopped = [(robot.robot.drive.bus, robot.stop(time_ns)) for robot in self.robots]
         frames = [TimedFrame(time_ns, bus, BRIDGE_NODE, frame) for bus, (of_robot, _) in stopped for frame in of_robot]
         return frames, next((failure for _, (_, failure) in stopped if failure), "")
 
     def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
-        """Makes happen what the scenario has for this instant; returns the frames of an e-stop, bus by bus."""
+        """Applies the scenario's e-stops and disturbances of this instant; returns the frames of e-stops, each with its bus."""
         frames = []
         stopped = {robot for event in self._estops.at(time_ns)[0] for robot in event.robots}
         for robot in sorted(stopped - self._stopped):
-            torques = self.robots[robot]
-            frames.append((torques.robot.drive.bus, torques.host.estop(time_ns)))
+            channel = self.robots[robot]
+            frames.append((channel.robot.drive.bus, channel.host.estop(time_ns)))
         for robot in self._stopped - stopped:
             self.robots[robot].host.start()
         self._stopped = stopped

@@ -1,8 +1,14 @@
-"""The virtual drives of a plan as a role: what the bus carries in, what drives answer and report out.
+"""The virtual drives of a plan as a role (docs/architecture.md, 5.2).
 
-Once per torque period the drives report: what they send on their own, and what they have to answer, at this instant.
-At its end they serve what the bridge says the bus carries until the next one, each frame at its instant.  Their wheels
-turn as the robots say; the torque that reaches a robot is what its drives report.
+It has two stages in each torque period:
+
+stage     what it does
+report    sends the frames of all drives at this instant: cyclic reports, and answers to earlier frames
+serve     takes the frames that the buses carry until the next report, each at its instant
+
+The wheels turn at the speeds that the robots say.  A robot takes the torque that its drives report.
+
+On a wall clock there are no stages; `receive` and `pass_time` take frames one by one.
 """
 
 from collections import Counter
@@ -24,22 +30,22 @@ from echelon.runtime.turns import Turn
 
 _SPEED = TORQUE_FIELDS.index("speed_right")
 FASTEST: Final = 1e6
-"""Wheel speed that no wheel has [rad/s]"""
+"""Wheel speeds beyond this are refused [rad/s]: no wheel turns as fast"""
 
 
 class PlacedDrive:
-    """A drive, its place on a bus, and what it has yet to send."""
+    """A drive, its place on a bus, and the frames that it has yet to send."""
 
     def __init__(self, plan: Plan, place: DrivePlace) -> None:
         self.place = place
         self.drive: Drive = make_drive(plan, place)
         self.outbox: list[Frame] = []
         self.waiting = 0
-        """Frames that it sent and that the bus did not carry yet"""
+        """Number of sent frames that the bus has not carried yet"""
         self.lost: Counter[int] = Counter()
-        """Frames that its queue had no room for, by identifier"""
+        """Frames that found the queue full, by identifier"""
         self.is_off = False
-        """Its controller is off the bus, and hears nothing"""
+        """True: its CAN controller is bus-off and hears nothing"""
 
     def take(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus; answers are sent with the next report."""
@@ -47,7 +53,7 @@ class PlacedDrive:
         self.outbox += self.drive.receive(time_ns, frame)
 
     def take_mark(self, mark: Frame) -> None:
-        """Takes what the bridge tells of the drive's controller."""
+        """Takes a mark of the bridge about the drive's CAN controller (bridge.frame_message)."""
         self.is_off = mark != BACK
         if mark == EMPTIED:
             self.waiting = 0
@@ -72,9 +78,9 @@ class DriveBank:
                 self._listeners[placed.place.bus].setdefault(can_id, []).append(placed)
         self._schedule = Schedule(event for event in plan.events if event.kind == "drive_fault")
         self._faults: set[tuple[int, int, str]] = set()
-        """Robot, wheel and fault of what is wrong on schedule"""
+        """The scenario's faults that are active: robot, wheel, fault"""
         self.refused: Counter[str] = Counter()
-        """What came as messages and cannot be"""
+        """Impossible values in messages, counted by reason"""
         self._events_ns = drives.first_ns - 1
         self._of_robot: list[list[PlacedDrive]] = [[] for _ in plan.robots]
         for placed in self.drives:
@@ -87,7 +93,7 @@ class DriveBank:
         )
 
     def _report(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Returns what all drives send at an instant."""
+        """The stage report: returns the frames that all drives send at this instant."""
         self.apply_events(time_ns)
         said = []
         for placed in self.drives:
@@ -102,12 +108,12 @@ class DriveBank:
         return (Message(Channel.FRAMES, self.index, sequence, time_ns, pack(said)),)
 
     def _serve(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Lets the drives work through what the buses carry until the next report."""
+        """The stage serve: gives the drives the frames that the buses carry until the next report."""
         frames, *robots = heard
         for message in robots:
             if message is not None:
                 self.turn(time_ns, message)
-        # Not those of an instant before, which a receiver holds when nothing newer comes.
+        # A message of an earlier instant is held if nothing newer comes; its frames were served then.
         for timed in unpack(frames.values) if frames is not None and frames.time_ns == time_ns else ():
             if not (time_ns <= timed.time_ns <= time_ns + self._period_ns and timed.node <= len(self.drives)):
                 self.refused["frame of no bus"] += 1
@@ -121,41 +127,41 @@ class DriveBank:
         return ()
 
     def _deliver(self, time_ns: int, bus: int, frame: Frame) -> None:
-        """Lets all drives have a frame that listen to it, and whose controllers are on the bus."""
+        """Gives a frame to all drives that listen to it and are not bus-off."""
         for placed in self._listeners[bus].get(frame.can_id, ()):
             if not placed.is_off:
                 placed.take(time_ns, frame)
 
-    # On a wall clock, frame by frame:
+    # on a wall clock, frame by frame:
 
     @property
     def due_ns(self) -> int:
-        """When one of the drives next has something to do on its own, or an event is due."""
+        """When `pass_time` must be called next: a drive or an event is due then."""
         return min([placed.drive.due_ns for placed in self.drives] + [self._next_event_ns])
 
     @property
     def turning(self) -> bool:
-        """True if there is torque on some wheel."""
+        """Whether any wheel has torque."""
         return any(motor.torque != 0.0 for placed in self.drives for motor in placed.drive.motors)
 
     def turn(self, time_ns: int, message: Message) -> None:
-        """Turns the wheels of a robot as it says."""
+        """Sets the wheel speeds of a robot from its message."""
         for placed in self._of_robot[message.source]:
-            placed.outbox += placed.drive.advance(time_ns)  # what was due before
+            placed.outbox += placed.drive.advance(time_ns)  # everything before happens at the old speed
             for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):
                 speed = float(message.values[_SPEED + wheel])
                 if abs(speed) <= FASTEST:
                     motor.set_speed(time_ns, speed)
-                else:  # of a robot whose numbers ran away
+                else:  # the robot's state has diverged
                     self.refused["speed"] += 1
 
     def receive(self, time_ns: int, bus: int, frame: Frame) -> list[TimedFrame]:
-        """Takes a frame from a bus; returns what the drives answer."""
+        """Takes a frame from a bus; returns the drives' answers."""
         self._deliver(time_ns, bus, frame)
         return self._emptied(time_ns)
 
     def pass_time(self, time_ns: int) -> list[TimedFrame]:
-        """Lets time pass; returns what the drives send on their own."""
+        """Lets time pass; returns the frames that the drives send by themselves."""
         if time_ns >= self._next_event_ns:
             self.apply_events(time_ns)
         for placed in self.drives:
@@ -177,7 +183,7 @@ class DriveBank:
         return NEVER_NS if next_ns is None else next_ns
 
     def apply_events(self, time_ns: int) -> None:
-        """Makes the scenario's faults happen that are due, and go away."""
+        """Begins and ends the scenario's drive faults that are due."""
         self._events_ns = time_ns
         active, _ = self._schedule.at(time_ns)
         faults = {(robot, wheel, event.fault) for event in active for robot in event.robots for wheel in event.wheels}
@@ -192,7 +198,7 @@ class DriveBank:
         return next(placed for placed in self._of_robot[robot] if wheel in placed.place.wheels)
 
     def report(self) -> DrivesReport:
-        """Returns the report of all drives; its buses hold the frames that were lost before they came to a bus."""
+        """Returns the report of all drives; its `buses` hold the frames that were lost before they reached a bus."""
         lost: list[Counter[int]] = [Counter() for _ in self._plan.can.buses]
         for placed in self.drives:
             lost[placed.place.bus] += placed.lost

@@ -1,9 +1,8 @@
-"""Torque that is mirrored: wheel torques in, CAN frames out, counted robot by robot. Pure.
+"""The mirrored torque path: wheel torques in, CAN frames out, counted for each robot (docs/architecture.md, 5.1). Pure.
 
-Each robot sends its torques once per acceleration period, and each becomes one frame at once; nothing is held back, so
-torques in the order (time, robot) give frames in that order. What must not reach a wheel becomes a frame with zero
-torque that does not enable, so that the drives stop instead of holding the torque before. So does what the envelope
-does not let pass.
+Each robot sends its torques once per acceleration period. They become frames at once, so frames have the order of the torques:
+by time, then by robot. Torques that must not reach a wheel, or that the envelope rejects, become frames with zero torque
+that do not enable. So drives stop instead of holding the torque before.
 """
 
 import math
@@ -29,25 +28,25 @@ class Stop(StrEnum):
 
 @dataclass(slots=True)
 class RobotCounts:
-    """What was seen of one robot. Torques are as commanded, before clipping [N m], right and left wheel."""
+    """Counts of one robot. Torques are as commanded, before clipping [N m]: right wheel, left wheel."""
 
     frames: int = 0
-    stopped: dict[str, int] = field(default_factory=dict)  # frames that did not enable; part of `frames`
-    repeated: int = 0  # torques for a period that had its frame: no frame
-    skipped: int = 0  # periods without torques between two that had them
+    stopped: dict[str, int] = field(default_factory=dict)  # frames that did not enable, by reason; part of `frames`
+    repeated: int = 0  # second torques for the same period; they made no frame
+    skipped: int = 0  # periods without torques between two periods with torques
     clipped: int = 0  # frames in which a torque was cut to the range of the frame
-    saturated: int = 0  # frames that say the robot's own limit was reached
+    saturated: int = 0  # frames that say that the robot's own limit was reached
     smallest: tuple[float, float] = (math.inf, math.inf)
     largest: tuple[float, float] = (-math.inf, -math.inf)
-    last_ns: int | None = None  # the newest torques turned into a frame
-    bits: BitCount = field(default_factory=BitCount)  # that its frames would take on a real bus
+    last_ns: int | None = None  # instant of the newest torques that became a frame
+    bits: BitCount = field(default_factory=BitCount)  # length of its frames on a real bus
 
 
 class TorqueMirror:
     """Turns torques into frames.
 
-    Parameters: the robots' hosts in the order of their numbers, the acceleration period [ns], and the robots' envelopes
-    (none: no limits). Raises ValueError for a period that is not positive."""
+    Parameters: the robots' hosts in the order of their numbers; the acceleration period [ns], one for all robots or one for
+    each; the robots' envelopes (none: no limits). Raises ValueError for a period that is not positive."""
 
     __slots__ = (
         "_envelopes",
@@ -75,10 +74,10 @@ class TorqueMirror:
     def encode(
         self, time_ns: int, robot: int, tau_right: float, tau_left: float, saturated: bool = False
     ) -> list[Frame]:
-        """The frame for the torques [N m] that robot number `robot` commands at `time_ns`.
+        """Returns the frames for the torques [N m] that robot number `robot` commands at `time_ns`.
 
-        Torques not finite, or older than the last ones, give a frame that stops the robot's drives; a second set of
-        torques for one instant gives none. Raises IndexError for a robot it does not have."""
+        Torques that are not finite, or older than the last ones, give frames that stop the robot's drives. A second pair of
+        torques for the same instant gives no frame. Raises IndexError for an unknown robot."""
         counts = self.counts[robot]
         last = counts.last_ns
         if last is not None and time_ns <= last:
@@ -108,7 +107,7 @@ class TorqueMirror:
         return self._send(robot, frames)
 
     def stop(self, robot: int, why: StrEnum = Stop.REQUESTED) -> list[Frame]:
-        """The frame that stops a robot's drives: torques 0, not enabled; for a robot that is silent, or an e-stop."""
+        """Returns the frames that stop a robot's drives: zero torque, not enabled; for a silent robot, or an e-stop."""
         counts = self.counts[robot]
         counts.stopped[why.value] = counts.stopped.get(why.value, 0) + 1
         if self._envelopes and counts.last_ns is not None:

@@ -1,1 +1,1 @@
-"""The bridge and the virtual drives at work on a bus: in one process, in a lockstep, on a wall clock."""
+"""The bridge and the virtual drives on real buses: in one process, in lockstep, on a wall clock."""

@@ -1,4 +1,4 @@
-"""The bridge on a closed torque path: its role, its buses, can.log and the DBC."""
+"""The bridge on the closed torque path with its role, its buses, can.log and the DBC files."""
 
 import time
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ LOG: Final = "can.log"
 
 
 class ClosedBridge(Bridge):
-    """The bridge of a plan whose torque path is closed, on the buses at `urls`; without any, frames go into the log alone.
+    """The bridge of a plan with a closed torque path, on the buses at `urls`.  Without URLs, frames go only into can.log.
 
-    `paired`: the drives are on the same buses, in another process, and `stages` go over the buses; otherwise frames are only
-    shown there, by `take`.  Raises ValueError or OSError if a bus or a file cannot be had.
+    `paired`: the drives are another process on the same buses, and the frames of `stages` really go over them.  Otherwise
+    `take` only shows the frames on the buses.  Raises ValueError or OSError if a bus or a file cannot be opened.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class ClosedBridge(Bridge):
         self.rail = Rail(self.buses)
         for bus, name in enumerate(dbc_names(plan)):
             (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
-        # The log begins with the bringing up of the drives; run time 0 is `can.bring_up` later.
+        # the log begins with the bring-up of the drives; run time 0 is `can.bring_up` later
         self._names = [bus.name for bus in plan.can.buses]
         self._log = CanLog(folder / LOG, self._names[0], plan.can.bring_up_ns)
         self.frames = 0
@@ -53,7 +53,7 @@ class ClosedBridge(Bridge):
             self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.log)
 
     def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Shows the frames that its own role put on the buses.  Returns nothing: those who watch have the role's messages."""
+        """Shows the frames of its own role on the buses.  Returns no messages: recorders get those of the role."""
         for message in messages:
             if message.channel is Channel.FRAMES and message.source == self.index:
                 frames = frames_of(message)
@@ -63,19 +63,20 @@ class ClosedBridge(Bridge):
         return []
 
     def log(self, frames: Sequence[TimedFrame]) -> None:
-        """Notes frames in can.log."""
+        """Writes frames to can.log."""
         wall_ns, write, names = time.monotonic_ns(), self._log.write, self._names
         for time_ns, bus, _, (can_id, data, remote) in frames:
             write(time_ns, can_id, data, wall_ns, names[bus], remote)
         self.frames += len(frames)
 
     def stop(self) -> None:
-        """Takes the torque away from all wheels and disables their drives: the end of every run, however it ends."""
+        """Takes the torque away from all wheels and disables their drives.  Every run ends with this call."""
         self.stop_at(self.role.next_ns)
 
     def stop_at(self, time_ns: int) -> None:
-        """Stops at an instant of run time: at once, and past the models of buses that are as slow as real ones.  After that it
-        raises PartRunError if a protocol that others wrote failed at it."""
+        """Does the same as `stop`, at run time `time_ns`.  The frames do not wait in the models of the buses.
+
+        Raises PartRunError afterwards if a user's own protocol failed at it."""
         self._robots = self.role.reports()
         frames, failure = self.role.stop(time_ns)
         for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
@@ -85,7 +86,7 @@ class ClosedBridge(Bridge):
             raise PartRunError(failure)
 
     def interrupt(self) -> None:
-        """Waits no more for a bus that takes no frames."""
+        """Ends any waiting for a bus that accepts no frames."""
         self.rail.stopping.set()
 
     def close(self) -> None:
@@ -95,7 +96,7 @@ class ClosedBridge(Bridge):
             bus.close()
 
     def progress(self) -> BridgeProgress:
-        """Returns how it stands."""
+        """Returns the present state, for a live table."""
         return BridgeProgress(
             url=self.url,
             load=max(bus.load for bus in self.role.buses),
@@ -106,7 +107,7 @@ class ClosedBridge(Bridge):
         )
 
     def report(self) -> CanReport:
-        """Returns what became of frames and torques; robots are as they were before `stop`."""
+        """Returns the report of the run; the wheels are as they were before `stop`."""
         fit = plan_fit(self.plan)
         buses = tuple(
             bus_report(self.plan, number, self.role.buses[number], bus.responses_ns) for number, bus in enumerate(fit)

@@ -1,4 +1,4 @@
-"""The virtual drives in a lockstep, in a process of their own: their frames really go over the buses."""
+"""The virtual drives in lockstep, in a process of their own: their frames really go over the buses."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,9 @@ from echelon.role import Stage
 
 
 class LockstepDrives:
-    """The virtual drives of a plan as a role, on the buses at `urls`.  Raises ValueError or OSError if a bus cannot be had."""
+    """The virtual drives of a plan as a role, on the buses at `urls`.
+
+    Raises ValueError for an invalid URL and OSError if a bus cannot be opened."""
 
     def __init__(self, plan: Plan, urls: Sequence[str]) -> None:
         self._bank = DriveBank(plan)
@@ -22,18 +24,18 @@ class LockstepDrives:
         self.stages: tuple[Stage, ...] = on_bus(self._bank.stages, self._rail, is_bridge=False)
 
     def interrupt(self) -> None:
-        """Waits no more for a bus that takes no frames."""
+        """Ends any waiting for a bus that accepts no frames."""
         self._rail.stopping.set()
 
     def stop(self) -> None:
-        """Does nothing: drives stop when the bridge says so, or when it says nothing any more."""
+        """Does nothing: drives stop when the bridge commands it, or by their watchdog when it is silent."""
 
     def progress(self) -> BridgeProgress:
-        """Returns how they stand."""
+        """Returns the present state, for a live table."""
         return BridgeProgress(note=self._rail.waiting)
 
     def report(self) -> DrivesReport:
-        """Returns what the drives saw."""
+        """Returns the report of all drives."""
         return replace(self._bank.report(), foreign=self._rail.foreign)
 
     def close(self) -> None:

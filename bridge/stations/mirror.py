@@ -1,4 +1,4 @@
-"""The bridge where torque is mirrored: robots' states in; frames out on the bus, in can.log, and as copies to the recorder."""
+"""The bridge on the mirrored torque path: robots' states in; frames out on the bus, into can.log, and to the recorder."""
 
 import time
 from collections.abc import Sequence
@@ -28,7 +28,9 @@ SATURATED: Final = STATE_FIELDS.index("saturated")
 
 
 class MirrorBridge(Bridge):
-    """A torque mirror with its buses, its log and its DBC.  Raises ValueError or OSError if a bus or a file cannot be had."""
+    """A torque mirror with its buses, can.log and its DBC files.
+
+    Raises ValueError for an invalid URL and OSError if a bus or a file cannot be opened."""
 
     def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
         self._plan = plan
@@ -49,9 +51,9 @@ class MirrorBridge(Bridge):
         self._time_ns = 0
 
     def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Sends the torques of robots' states; returns the frames as messages, one per instant.
+        """Sends the torques in the robots' states; returns messages with the frames, one per instant.
 
-        The state at the start says nothing of torque: the first frame of a robot ends its first period.
+        The state at run time 0 holds no torque.  So a robot's first frame comes at the end of its first period.
         """
         copies: list[Message] = []
         words: list[int] = []
@@ -75,10 +77,10 @@ class MirrorBridge(Bridge):
         return copies
 
     def stop(self) -> None:
-        """Does nothing: mirrored frames turn no wheel."""
+        """Does nothing, since mirrored frames turn no wheel."""
 
     def flush(self) -> None:
-        """Hands what is logged to the operating system."""
+        """Hands all lines of can.log to the operating system."""
         self._log.flush()
 
     def close(self) -> None:
@@ -88,7 +90,7 @@ class MirrorBridge(Bridge):
             bus.close()
 
     def progress(self) -> BridgeProgress:
-        """Returns how it stands."""
+        """Returns the present state, for a live table."""
         return BridgeProgress(
             url=self.url,
             load=max(self._loads()),
@@ -97,7 +99,7 @@ class MirrorBridge(Bridge):
         )
 
     def report(self) -> CanReport:
-        """Returns what became of frames and torques, and the load this would be on real buses."""
+        """Returns the report of the run, with the load that the frames would make on real buses."""
         loads, fit = self._loads(), plan_fit(self._plan)
         return CanReport(
             path="mirror",
@@ -126,7 +128,7 @@ class MirrorBridge(Bridge):
         )
 
     def _loads(self) -> list[float]:
-        """Returns the share of each bus that its frames so far would take if it were real, in run time."""
+        """Returns the load so far that the frames would make on each bus if it were real, in run time."""
         frames, bits = [0] * len(self._names), [0] * len(self._names)
         for bus, counts in zip(self._bus_of, self._mirror.counts, strict=True):
             frames[bus] += counts.frames

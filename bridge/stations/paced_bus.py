@@ -1,11 +1,14 @@
-"""A bus on a wall clock that is as fast as a real one: frames wait in a model of it, and go out when they are over there.
+"""A bus on a wall clock that is only as fast as a real one (docs/architecture.md, 5.6).
 
-A virtual interface carries any number of frames at once.  Here each process has a model of the bus
-(bridge.timing.arbitration) with its own frames in it, and those it heard of others; it puts a frame on the interface at the
-end of the time that the frame takes in the model.
-So all together send no more than the bit rate allows, by priority as far as one can know of the others; what finds no
-room is lost; error frames and bus-off happen in the model. With an ideal bus for a model, frames go out at once: a real
-bus takes its own time."""
+A virtual interface carries any number of frames at once.  So each process has a model of the bus (bridge.timing.arbitration)
+with its own frames and with those that it heard from other processes.  It puts a frame on the interface when the frame ends in
+the model.
+
+Together the processes then send no more than the bit rate allows.  Priorities hold as far as a process knows the frames of the
+others.  Frames that find a queue full are lost.  Error frames and bus-off happen in the model.
+
+With an ideal bus as the model, frames go out at once: a real bus takes its own time.
+"""
 
 from echelon.bridge.can.bus import Bus
 from echelon.bridge.protocols.frame import Frame
@@ -13,9 +16,9 @@ from echelon.bridge.timing.bus_model import BusEventKind, BusModel, Delivered
 
 
 class PacedBus:
-    """A bus and its model.  Times are run time, and never run backwards.
+    """A bus and its model.  Times are run time [ns] and never run backwards.
 
-    After a standstill, frames that were over for more than `old_ns` are not sent any more, and count as lost."""
+    A frame that ended in the model more than `old_ns` ago is not sent but counts as lost; this happens after a standstill."""
 
     def __init__(self, bus: Bus, model: BusModel, old_ns: int) -> None:
         self.bus, self.model = bus, model
@@ -23,19 +26,19 @@ class PacedBus:
         self._seen = 0
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
-        """Puts a frame into the queue of a node of this process; False: it is lost, and counted in the model."""
+        """Puts a frame into the queue of a node of this process.  Returns False if it is lost; the model counts it."""
         queued = self.model.send(time_ns, node, frame)
         if self.model.is_off(node):
-            self.model.clear(node)  # as all that waited when it went off: it would be old when it is back
+            self.model.clear(node)  # all waiting frames would be old when the node comes back
             return False
         return queued
 
     def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
-        """Takes note of a frame that came from the bus, where it was over at `end_ns`."""
+        """Notes a frame that came from the bus, where it was over at `end_ns`."""
         self.model.hear(time_ns, frame, end_ns)
 
     def run(self, time_ns: int) -> list[Delivered]:
-        """Sends what is over by now; returns what the bus took."""
+        """Sends the frames that are over in the model by now; returns those that the bus accepted."""
         taken = []
         for sent in self.model.run(time_ns):
             can_id, data, remote = sent.frame
@@ -52,5 +55,5 @@ class PacedBus:
 
     @property
     def due_ns(self) -> int | None:
-        """When `run` is next to be called; None: nothing waits."""
+        """When `run` must be called next; None: no frame waits."""
         return self.model.due_ns

@@ -1,11 +1,11 @@
-"""A station's frames on a real bus in virtual time.
+"""Frames over a real bus in virtual time: the time rail (docs/architecture.md, 5.2).
 
-The message that says which frames a bus carries, and when, is the time rail: frames themselves carry no virtual time.
-Who sends puts the frames on the bus first, and the message after them; who receives takes the message, waits for just
-these frames to come from the bus, bit for bit, before it goes on.  So nothing is used that the bus did not carry, and the run
-is the same at every speed.  Frames of others on the same bus are counted and not used.
+A *station* is a process on the bus: the bridge or the drives.  Frames carry no virtual time.  So a `FRAMES` message, the time
+rail, says which frames a bus carries and when.  The sender puts the frames on the bus first and sends the message after them.
+The receiver takes the message and then waits until exactly these frames have come from the bus.  So a station uses no
+frame that the bus did not carry, and a run gives the same result at every speed.  Foreign frames are counted and not used.
 
-While a bus takes no frames (its interface is down) the run stands still, and goes on with it.
+While a bus accepts no frames (its interface is down), the run waits.  It goes on when the bus does.
 """
 
 import threading
@@ -21,12 +21,12 @@ from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 
 LOST_AFTER_S: Final = 5.0
-"""A frame that was put on the bus and has not come by then will not come."""
+"""A frame that has not come after this time counts as lost."""
 RETRY_S: Final = 0.02
 
 
 class BusError(Exception):
-    """A bus did not carry what was put on it; the text says what."""
+    """A bus lost a frame that was put on it."""
 
 
 class Rail:
@@ -35,13 +35,13 @@ class Rail:
     def __init__(self, buses: Sequence[Bus]) -> None:
         self.buses = buses
         self.foreign = 0
-        """Frames that nobody of this run had announced"""
+        """Number of frames that no process of this run had announced"""
         self.waiting = ""
-        """Why the run stands still, if it does"""
+        """Why the run waits for a bus; empty if it does not"""
         self.stopping = threading.Event()
 
     def put(self, frames: Sequence[TimedFrame]) -> None:
-        """Puts frames on their buses; waits while one takes none.  Raises SystemExit when the run is to stop."""
+        """Puts frames on their buses; waits while a bus accepts none.  Raises SystemExit if `stopping` is set meanwhile."""
         for time_ns, bus, _, (can_id, data, remote) in frames:
             while not self.buses[bus].send(can_id, data, time_ns, remote):
                 self.waiting = f"{self.buses[bus].url} takes no frames: {self.buses[bus].error}"
@@ -60,7 +60,9 @@ class Rail:
         while True:
             received = bus.recv(max(0.0, deadline_s - time.monotonic()))
             if received is None:
-                if time.monotonic() < deadline_s:  # an error, e.g. an interface that went down: wait for its return
+                if (
+                    time.monotonic() < deadline_s
+                ):  # receiving failed, for example since the interface is down: try again
                     self.stopping.wait(RETRY_S)
                     continue
                 raise BusError(f"{bus.url} lost a frame: {wanted.can_id:03X}#{wanted.data.hex().upper()} did not come")
@@ -72,9 +74,11 @@ class Rail:
 def on_bus(
     stages: Sequence[Stage], rail: Rail, is_bridge: bool, said: Callable[[list[TimedFrame]], None] = lambda frames: None
 ) -> tuple[Stage, ...]:
-    """Returns a station's stages with their frames going over the buses; `said` gets all frames of what it says.
+    """Returns the stages of a station, changed so that their frames go over the buses.
 
-    The bridge's messages hold all frames of a bus; those with its own node number are its own.
+    `is_bridge` says whether the station is the bridge or the drives.  `said` is called with all frames of each message that the
+    station sends.  The bridge's messages hold all frames of a bus, also those of the drives; a station puts only the
+    frames of its own nodes on the bus, and waits only for those of the others.
     """
 
     def own(timed: TimedFrame) -> bool:

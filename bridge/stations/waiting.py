@@ -1,5 +1,5 @@
-"""What the processes between robots and wheels share on a wall clock: robots' torques as they come, sleeping until there is
-something to do, and taking what has come from a bus."""
+"""Shared parts of bridge and drives on a wall clock: a mailbox for the robots' torques, reading from a bus, the clock of the
+run, and sleeping until something comes."""
 
 import os
 import select
@@ -14,13 +14,16 @@ from echelon.plan.plan import Plan
 from echelon.runtime.wire import WireError, count_refusal, decode
 
 PROGRESS_NS: Final = 200_000_000
-"""How often a process tells how things stand, and looks whether it is told something."""
+"""How often a process reports its progress and reads its orders; the longest sleep of `wait_for`."""
 AT_ONCE: Final = 256
-"""Frames taken from a bus before it is looked at what else there is to do."""
+"""The largest number of frames that are read from a bus at once."""
 
 
 class Mail:
-    """Robots' torques as they come, in Zenoh's thread; with `wakes`, `fileno` becomes readable."""
+    """A mailbox for the robots' torques.
+
+    Zenoh's thread calls `receive`, the bridge's or drives' thread calls `take`.  With `wakes`, `fileno` is readable while
+    messages are there.  `refused` counts invalid payloads by reason."""
 
     def __init__(self, plan: Plan, wakes: bool = True) -> None:
         self._robots = len(plan.robots)
@@ -30,7 +33,7 @@ class Mail:
         self.refused: dict[str, int] = {}
 
     def receive(self, payload: bytes) -> None:
-        """Takes a payload."""
+        """Takes a message as bytes; an invalid one is counted and dropped."""
         try:
             message = decode(payload)
             if message.channel is not Channel.TORQUE or message.source >= self._robots:
@@ -45,7 +48,7 @@ class Mail:
             os.eventfd_write(self._wake, 1)
 
     def take(self) -> list[Message]:
-        """Returns what has come."""
+        """Returns the messages that have come since the last call."""
         if self._wakes:
             try:
                 os.eventfd_read(self._wake)
@@ -54,12 +57,12 @@ class Mail:
         return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def fileno(self) -> int:
-        """For select."""
+        """The file descriptor to wait for with `select`."""
         return self._wake
 
 
 def drained(bus: Bus) -> Iterator[Received]:
-    """Yields what has come from a bus, but no more than `AT_ONCE` frames: who babbles must not keep us from all else."""
+    """Yields the frames that have come from a bus, at most `AT_ONCE`: a node that floods the bus must not block the caller."""
     for _ in range(AT_ONCE):
         received = bus.recv(0.0)
         if received is None:
@@ -68,21 +71,21 @@ def drained(bus: Bus) -> Iterator[Received]:
 
 
 class RunClock:
-    """Run time [ns] on a wall clock; 0 is at `start_ns` of the monotonic clock, now unless given."""
+    """Run time [ns] on a wall clock.  Run time 0 is at `start_ns` of the monotonic clock; None means now."""
 
     def __init__(self, start_ns: int | None = None) -> None:
         self._start_ns = time.monotonic_ns() if start_ns is None else start_ns
         self._epoch_ns = time.time_ns() - time.monotonic_ns() + self._start_ns
 
     def now(self) -> int:
-        """Returns the run time."""
+        """Returns the present run time."""
         return time.monotonic_ns() - self._start_ns
 
     def of(self, time_ns: int) -> int:
-        """Returns the run time of an instant since 1970, as the kernel stamps what it received."""
+        """Returns the run time of a time stamp of the kernel [ns since 1970]."""
         return time_ns - self._epoch_ns
 
 
 def wait_for(sources: Sequence[Any], left_ns: int) -> None:
-    """Sleeps until one of the sources is readable or the time is over."""
+    """Sleeps until one of the sources is readable, or for `left_ns`, but not longer than `PROGRESS_NS`."""
     select.select(sources, (), (), min(max(left_ns, 0), PROGRESS_NS) * 1e-9)

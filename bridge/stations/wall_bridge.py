@@ -1,7 +1,7 @@
-"""The bridge on a wall clock.
+"""The bridge on a wall clock (docs/architecture.md, 5.2).
 
-It sleeps until a frame, a robot's torque or an instant of its own comes.  A torque becomes frames as soon as it has come;
-a robot that says nothing in a period has its last torque sent again, until the envelope finds that too old.
+It sleeps until a frame or a torque comes, or until it is due itself.  A torque becomes frames as soon as it comes.  If none
+came from a robot in a period, its last torque is sent again; the envelope turns it into zero when it is too old.
 """
 
 from array import array
@@ -29,18 +29,18 @@ from echelon.runtime.link import Link
 from echelon.runtime.wire import count_refusal, encode, join
 
 FEEDBACK_SHARE: Final = 8
-"""Robots are told the torques of their wheels when all drives have reported them, or after this part of a period."""
+"""Robots get the torques of their wheels when all drives have reported, or after 1/FEEDBACK_SHARE of the period."""
 OLDEST_NS: Final = 10_000_000_000
-"""Messages older than this are not of this run."""
+"""Messages older than this are refused."""
 OTHER_NODE: Final = 1
-"""What frames are noted as that others sent: which of them cannot be told from a frame."""
+"""The node number of all frames from the bus: a frame does not say which drive sent it."""
 
 
 class WallBridge(Bridge):
-    """The bridge on a wall clock.  Times are run time, by `clock`, which is set when the run starts.
+    """The bridge on a wall clock.  Times are run time by `clock`, which must be replaced when the run starts.
 
-    `tell_wheels` sends a payload to the robots, `watch` a batch to those who watch (None: nobody does).  Robots' torques go
-    into `mail`.  Raises ValueError or OSError if a bus or a file cannot be had."""
+    `tell_wheels` sends a message as bytes to the robots.  `watch` sends a batch of messages to recorders; None: there are none.
+    Robots' torques arrive in `mail`.  Raises ValueError or OSError if a bus or a file cannot be opened."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class WallBridge(Bridge):
         assert plan.bridge is not None
         self._period_ns = plan.bridge.period_ns
         self._last: list[Message | None] = [None] * len(plan.robots)
-        self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period that a robot's torque was last sent in
+        self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period in which a robot's torque was last sent
         self._cycle = -plan.can.bring_up_ns // self._period_ns
         self._told = -1
         self._frames: list[TimedFrame] = []
@@ -77,7 +77,7 @@ class WallBridge(Bridge):
         self._flying: list[tuple[int, int, int, Message]] = []
         self.link_lost = 0
         self._awaited: dict[tuple[int, int], deque[tuple[int, int]]] = {}
-        """By bus and identifier: when torque frames were queued, and of which instant they are"""
+        """Torque frames on their way, by bus and identifier: when each was queued, and the instant of its state"""
         self.came = 0
         self.latencies = array("q")
         self.clock = RunClock()
@@ -87,7 +87,7 @@ class WallBridge(Bridge):
 
     @property
     def due_ns(self) -> int:
-        """When there is something to do without anything having come."""
+        """When `serve` must be called even if nothing comes."""
         at_ns = self._cycle * self._period_ns
         if self._told < self._cycle - 1 and self._cycle > 0:
             at_ns += self._period_ns // FEEDBACK_SHARE - self._period_ns
@@ -97,24 +97,26 @@ class WallBridge(Bridge):
 
     @property
     def sources(self) -> list[Any]:
-        """What to wait for, for `select`.  What drives say is of use when a period has ended; until then it can wait for the
-        next torque, except where the model of a bus must know of every frame."""
+        """The sources to wait for with `select`: torques, and buses if their frames are needed at once.
+
+        Feedback is needed only when a period has ended; before, it can wait for the next torque.  The model of a paced bus
+        needs every frame at once."""
         listens = self._told < self._cycle - 1 or self.plan.can.paced
         return [self.mail, *(self._closed.buses if listens else ())]
 
     def serve(self) -> None:
-        """Does what there is to do now."""
+        """Does everything that is due now: takes frames and torques, sends, begins a new period."""
         self._frames_from_buses(self.clock.now())
         self._torques()
         self._carry(self.clock.now())
         self._pass_time(self.clock.now())
 
     def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Does nothing: torques come through `mail`."""
+        """Does nothing, since torques come through `mail`."""
         return []
 
     def _torques(self) -> None:
-        """Takes robots' torques as their links let them arrive, and sends them."""
+        """Takes the robots' torques from `mail`, applies loss and delay of their links, and sends those that have arrived."""
         for message in self.mail.take():
             now_ns = self.clock.now()
             if not self._plausible(now_ns, message):
@@ -131,7 +133,7 @@ class WallBridge(Bridge):
             self._take(self.clock.now(), heappop(self._flying)[-1])
 
     def _plausible(self, now_ns: int, message: Message) -> bool:
-        """Holds a message against the clock: it is of a period of this run that has begun, and not long over."""
+        """Returns whether a message belongs to a period of this run that has begun and is not older than `OLDEST_NS`."""
         age_ns = now_ns - message.time_ns
         return message.time_ns == message.sequence * self._period_ns and -self._period_ns <= age_ns <= OLDEST_NS
 
@@ -140,30 +142,30 @@ class WallBridge(Bridge):
         if before is None or message.sequence > before.sequence:
             self._last[message.source] = message
             self.came += 1
-            if message.sequence >= now_ns // self._period_ns - 1:  # or else newer ones are on their way
+            if message.sequence >= now_ns // self._period_ns - 1:  # otherwise newer torques are on their way
                 self._send_robot(now_ns, message.source, message.sequence, message.time_ns)
 
     def _frames_from_buses(self, now_ns: int) -> None:
-        """Takes what has come from the buses."""
+        """Takes the frames that have come from the buses."""
         for number, bus in enumerate(self._closed.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
-                came_ns = min(self.clock.of(received.time_ns), now_ns)  # as the kernel saw it
+                came_ns = min(self.clock.of(received.time_ns), now_ns)  # by the kernel's time stamp
                 self._buses[number].hear(now_ns, frame, came_ns)
                 if not self._role.buses[number].is_off(BRIDGE_NODE):
                     self._role.receive(now_ns, number, frame)
                 self._note(TimedFrame(came_ns, number, OTHER_NODE, frame))
 
     def _pass_time(self, now_ns: int) -> None:
-        """Does what is due: a new period, and telling robots of the one that ended."""
+        """Begins a new period if it is due; tells the robots the torques of their wheels in the period that ended."""
         if now_ns >= self._cycle * self._period_ns:
-            # After a standstill the periods that are over stay without frames; a burst of them would help nobody.
+            # after a standstill, the periods that were missed get no frames: a burst of old torques would be useless
             self._cycle = now_ns // self._period_ns
             for bus, frames in self._role.apply_events(now_ns):
                 for frame in frames:
                     self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
             for robot in range(len(self._last)):
-                self._send_robot(now_ns, robot, self._cycle - 1)  # again, if nothing newer came
+                self._send_robot(now_ns, robot, self._cycle - 1)  # repeats the last torque if none came in the period
             for bus, frames in self._role.bus_frames(now_ns):
                 for frame in frames:
                     self._buses[bus].send(now_ns, BRIDGE_NODE, frame)
@@ -182,13 +184,13 @@ class WallBridge(Bridge):
                     self._watch(join([payload]))
 
     def _carry(self, now_ns: int) -> None:
-        """Lets buses take what they can have taken by now."""
+        """Sends the frames that the buses can have carried by now; measures the latency of torques."""
         for number, bus in enumerate(self._buses):
             for queued_ns, _, _, frame in bus.run(now_ns):
                 self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
                 awaited = self._awaited.get((number, frame.can_id))
                 while awaited and awaited[0][0] < queued_ns:
-                    awaited.popleft()  # lost on the way
+                    awaited.popleft()  # this frame was lost
                 if awaited and awaited[0][0] == queued_ns:
                     latency_ns = now_ns - awaited.popleft()[1]
                     self.latencies.append(latency_ns)
@@ -208,14 +210,14 @@ class WallBridge(Bridge):
         self._closed.close()
 
     def progress(self) -> BridgeProgress:
-        """Returns how it stands."""
+        """Returns the present state, for a live table."""
         return replace(self._closed.progress(), load=max(self._loads()))
 
     def report(self) -> CanReport:
-        """Returns what became of frames and torques."""
+        """Returns the report of the run."""
         report = self._closed.report()
         buses = [replace(bus, load=load) for bus, load in zip(report.buses, self._loads(), strict=True)]
-        if not self.plan.can.paced:  # how long its frames take the bus alone knows
+        if not self.plan.can.paced:  # the latencies on a real bus cannot be measured here
             buses = [replace(bus, identifiers={}) for bus in buses]
         return replace(
             report,
@@ -240,14 +242,15 @@ class WallBridge(Bridge):
         )
 
     def _loads(self) -> list[float]:
-        """Returns the share of each bus that its frames took since drives are brought up."""
+        """Returns the load of each bus since the bring-up began."""
         since_s = max(1, self._cycle * self._period_ns + self.plan.can.bring_up_ns) / 1e9
         return [bits.bits / bus.bitrate / since_s for bits, bus in zip(self._bits, self.plan.can.buses, strict=True)]
 
     def _send_robot(self, now_ns: int, robot: int, cycle: int, state_ns: int | None = None) -> None:
-        """Sends the newest torque of a robot for a period, once: one that is late goes with the next period's.
+        """Sends the newest torque of a robot, at most once in each period: a second one waits for the next period.
 
-        `state_ns` is the instant of the state that it was computed from, if it is new."""
+        `cycle` is the number of the period.  `state_ns` is the instant of the state that the torque was computed from; None if
+        the torque was sent before."""
         if cycle <= self._sent_in[robot]:
             return
         torques = self._role.robots[robot]
@@ -256,7 +259,7 @@ class WallBridge(Bridge):
         frames = torques.frames(now_ns, self._last[robot])
         queued = [self._buses[bus].send(now_ns, BRIDGE_NODE, frame) for frame in frames]
         if state_ns is not None and torques.torque_frames and queued[-1]:
-            # What was wanted is on the bus with the last of its frames.
+            # the torque has reached the drives with the last of its frames
             key = bus, frames[-1].can_id
             self._awaited.setdefault(key, deque(maxlen=self.plan.can.queue)).append((now_ns, state_ns))
         self._carry(now_ns)
@@ -266,10 +269,10 @@ class WallBridge(Bridge):
         self._bits[timed.bus].add(*timed.frame)
 
     def _flush(self) -> None:
-        """Logs the frames of a period, and shows them to those who watch."""
+        """Writes the frames of a period to can.log and sends them to recorders."""
         if not self._frames:
             return
-        # In order of time, also after what is logged already: a stamp may be older than what was written meanwhile.
+        # the log must be in order of time, but a time stamp may be older than a frame that is already logged
         self._frames.sort(key=lambda timed: timed.time_ns)
         self._frames = [timed._replace(time_ns=max(timed.time_ns, self._logged_ns)) for timed in self._frames]
         self._logged_ns = self._frames[-1].time_ns

@@ -31,12 +31,12 @@ class WallDrives:
 
     @property
     def due_ns(self) -> int:
-        """When there is something to do without anything having come."""
+        """When the drives must work even if no frame comes."""
         due_ns = min(self.bank.due_ns, self._disturbances.due_ns)
         return min([due_ns, *(end_ns for bus in self._buses if (end_ns := bus.due_ns) is not None)])
 
     def serve(self, clock: RunClock, also: Sequence[Any] = ()) -> None:
-        """Waits for what comes next, a frame or an instant of their own, and lets the drives work; `also` ends the wait too."""
+        """Waits for a frame, for one of `also`, or until `due_ns`; then lets the drives work."""
         wait_for([*also, *(paced.bus for paced in self._buses)], self.due_ns - clock.now())
         for number, paced in enumerate(self._buses):
             for received in drained(paced.bus):
@@ -58,7 +58,7 @@ class WallDrives:
             self._buses[bus].send(time_ns, node, frame)
 
     def report(self) -> DrivesReport:
-        """Returns the report of all drives.  Of buses it knows something only where they are paced."""
+        """Returns the report of all drives.  It reports on buses only if they are paced."""
         counts = [paced.bus.counts for paced in self._buses]
         buses: tuple[BusReport, ...] = ()
         if self.plan.can.paced:
@@ -71,6 +71,6 @@ class WallDrives:
         return replace(self.bank.report(), failed=failed, buses=buses)
 
     def lost_and_destroyed(self) -> tuple[int, int]:
-        """Returns how many frames a paced bus lost, and how many it destroyed, which were sent again."""
+        """Returns how many frames the paced buses lost, and how many attempts were destroyed."""
         rows = [row for paced in self._buses for row in paced.model.traffic.values()]
         return sum(row.lost for row in rows), sum(row.retransmitted for row in rows)

@@ -1,1 +1,1 @@
-"""A bus in time: arbitration, errors, queues, worst-case waits; nothing here waits or does input or output."""
+"""Models of a bus in time: arbitration, errors, queues, worst-case response times.  Pure."""

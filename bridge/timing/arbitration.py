@@ -1,23 +1,28 @@
-"""One CAN bus in time: who sends when, what waits, what is destroyed and sent again.  Pure, integer nanoseconds.
+"""A model of one CAN bus: arbitration, queues, errors and retransmission (docs/architecture.md, 5.6).
 
-Whenever the bus is free, the waiting frame with the lowest identifier starts, whichever node it waits at; of a data and a
-remote frame with the same identifier the data frame.  It takes the bits that `frame_bits` counts; it is delivered with the
-last bit of its end of frame, and blocks the bus for three bits more.  A bit lasts 1/bitrate, the frame is rounded up to
-whole nanoseconds.
+Pure.  Instants are integer nanoseconds.  A bit lasts 1/bitrate; the length of a frame is rounded up to nanoseconds.
 
-Errors.  An attempt to send is destroyed with a given probability, at a bit that is drawn (bridge.timing.error_draws).  Then
-follow the error flag, its echo, the delimiter and the interframe space, and the frame waits again.
+*Arbitration.*  When the bus is free, the waiting frame with the lowest identifier starts, at whichever node it waits.  With
+the same identifier, a data frame goes before a remote frame, and then the frame that was queued first.  A frame takes
+`frame_bits` bits.  It is delivered with the last bit of its end of frame; then the bus is blocked for three more bits.
 
-Error counters (ISO 11898-1, what a bus with one error at a time needs): the sender of a destroyed frame counts 8, each
-other node 1; each delivered frame takes 1 from its sender and from the receivers.  Over 127 a node is error passive and
-waits 8 bits longer after a frame of its own; over 255 (errors in sending) it is off: it neither sends nor counts until,
-`restart_ns` later, it has seen 128 times 11 recessive bits.  Its frames wait meanwhile, as many as fit.
+*Errors.*  An attempt to send is destroyed with a given probability, at a random bit (bridge.timing.error_draws).  Error flag,
+echo, delimiter and interframe space follow; then the frame waits again.
 
-A node is any number; it counts errors from its first frame on.  Two nodes should not send the same identifier: if they do,
-what was sent first goes first.
+*Error counters* follow ISO 11898-1, as far as a bus with one error at a time needs it.  Each node has a transmit error counter
+(TEC) and a receive error counter (REC) and counts from its first frame on.  A destroyed frame adds 8 to the TEC of its sender
+and 1 to the REC of each other node.  A delivered frame takes 1 from the TEC of its sender and 1 from each other REC.
 
-Frames of others, whose queues this model does not have, took the bus before they were over if it was free; those
-that were sent meanwhile wait like all others, and take it then: so several models that hear each other share one bus.
+state           entered when                                    what the node does
+error active    at first; both counters are at most 127         sends without restrictions
+error passive   a counter is over 127                           waits 8 more bits after each of its own frames
+bus-off         TEC is over 255, or `bus_off` was called        does not send or count; its frames wait in its queue.
+                                                                `restart_ns` later it starts to count idle times; after 128
+                                                                times 11 recessive bits it is error active, counters at zero
+
+*Frames of other processes.*  This model does not have their queues; it learns of them by `hear` when they are over.  If the
+bus was free, it was occupied by such a frame just before.  Otherwise the frame waits with the others and occupies the bus
+later.  So several models that hear each other share one bus.
 """
 
 from collections import defaultdict
@@ -32,20 +37,20 @@ from echelon.bridge.timing.bus_model import BusEvent, BusEventKind, BusModel, De
 from echelon.bridge.timing.error_draws import INTERFRAME, ErrorDraws
 
 CAPACITY = 64
-"""Frames that a node holds unless told otherwise (SocketCAN's own default is 10)"""
+"""Default length of a node's queue [frames] (SocketCAN's default is 10)"""
 PASSIVE_OVER, OFF_OVER = 127, 255
-RECOVERED_REC = 119  # what an error passive receiver counts after a good frame: 119 .. 127 by the standard
+RECOVERED_REC = 119  # REC of an error passive receiver after a good frame: the standard allows 119 .. 127
 
 _ERROR_FLAG, _ERROR_DELIMITER = 6, 8
 _SUSPEND = 8
 _RECESSIVE, _RECESSIVE_RUNS = 11, 128
 _EVER = -(2**62)
 _NEVER = 2**62
-_OTHERS = -1  # stands for the node of what was heard
+_OTHERS = -1  # node number of all frames that other processes sent
 
 
 class _Waiting(NamedTuple):
-    """A frame in a queue; in order of priority, then of sending."""
+    """A frame in a queue.  Tuples compare in the order in which frames are sent: by priority, then by the order of queueing."""
 
     priority: int
     order: int
@@ -57,6 +62,8 @@ class _Waiting(NamedTuple):
 
 @dataclass(slots=True)
 class _Node:
+    """A node: number of frames in its queue, error counters, and whether it is error passive."""
+
     held: int = 0
     tec: int = 0
     rec: int = 0
@@ -65,18 +72,20 @@ class _Node:
 
 @dataclass(slots=True)
 class _Off:
-    """How far a node is on its way back: what it must still see, and from when on it looks."""
+    """The recovery of a node that is bus-off: it counts from `from_ns` on, and still needs `runs` times 11 recessive bits."""
 
     from_ns: int
     runs: int = _RECESSIVE_RUNS
 
 
-class BusTime(BusModel):
-    """A bus of `bitrate` [bit/s]; see `BusModel`.
+class ArbitratedBus(BusModel):
+    """A CAN bus with arbitration, queues and errors; a `BusModel`.
 
-    `capacity` is how many frames a node holds, the one on the bus included; `note_errors` makes an event of each frame that is
-    destroyed, not only a count.  Raises ValueError for a bit rate or a
-    capacity under 1, an error rate outside 0 .. 1, or a negative `restart_ns`."""
+    Parameters: `bitrate` [bit/s]; `seed` and `bus_number`, the key of the error draws; `capacity`, the length of a node's queue
+    [frames], the frame on the bus included; `error_rate`, the probability that an attempt is destroyed; `restart_ns`, the
+    time until a node that is bus-off starts its recovery; `note_errors`, whether each destroyed frame becomes an event.
+
+    Raises ValueError for a bit rate or a capacity under 1, an error rate outside 0 .. 1, or a negative `restart_ns`."""
 
     def __init__(
         self,
@@ -102,16 +111,16 @@ class BusTime(BusModel):
         self._pending: list[_Waiting] = []  # heap
         self._current: _Waiting | None = None
         self._destroyed = False
-        self._end_ns = _EVER  # of the current attempt: delivered, or destroyed
-        self._free_ns = _EVER  # the bus, after the current attempt
-        self._suspended: dict[int, int] = {}  # the error passive node that sent last: when it may start
+        self._end_ns = _EVER  # end of the current attempt: the frame is delivered or destroyed then
+        self._free_ns = _EVER  # when the bus is free after the current attempt
+        self._suspended: dict[int, int] = {}  # the error passive node that sent last, and when it may start again
         self._off: dict[int, _Off] = {}
-        self._marked: set[int] = set()  # nodes with an error counter that is not zero
+        self._marked: set[int] = set()  # nodes with an error counter above zero
         self._delivered: list[Delivered] = []
         self._began_ns: int | None = None
-        self._now_ns = _EVER  # everything earlier is decided
+        self._now_ns = _EVER  # the model is decided up to this instant
         self._order = self._busy_ns = 0
-        self._others = 0  # frames of others that still have to take their time
+        self._others = 0  # number of waiting frames of other processes
         self._draws = ErrorDraws(seed, bus_number)
         self._attempts = 0
         self.set_error_rate(error_rate)
@@ -127,7 +136,9 @@ class BusTime(BusModel):
         if not self._pending:
             return None
         if self._rate or self._suspended or self._off:
-            return self._next_start() + 1  # then it is known who sends, and how long
+            return (
+                self._next_start() + 1
+            )  # only at its start is it known which frame is sent, and whether it is destroyed
         return self._next_start() + self._span(self._pending[0].bits - INTERFRAME)
 
     @property
@@ -140,7 +151,7 @@ class BusTime(BusModel):
         return self.busy_ns / passed_ns if passed_ns else 0.0
 
     def counters(self, node: int) -> tuple[int, int]:
-        """The transmit and the receive error counter of a node."""
+        """Returns the transmit and the receive error counter of a node."""
         known = self._nodes.get(node, _Node())
         return known.tec, known.rec
 
@@ -208,7 +219,7 @@ class BusTime(BusModel):
         return -(-bits * 1_000_000_000 // self.bitrate)
 
     def _advance(self, until_ns: int) -> None:
-        """Decides what starts before `until_ns`, and finishes what ends by then."""
+        """Starts the attempts that start before `until_ns`, and finishes those that end by then."""
         if until_ns < self._now_ns:
             raise ValueError(f"time must not be before {self._now_ns} ns, not {until_ns!r}")
         if self._began_ns is None:
@@ -227,7 +238,7 @@ class BusTime(BusModel):
         self._now_ns = until_ns
 
     def _next_start(self) -> int:
-        """When the next attempt starts if nothing more is sent."""
+        """Returns when the next attempt starts if no other frame is sent before."""
         if not self._pending:
             return _NEVER
         start_ns = max(self._now_ns, self._free_ns)
@@ -236,14 +247,15 @@ class BusTime(BusModel):
         return start_ns
 
     def _ready_ns(self, node: int) -> int:
-        """From when on a node may start, if the bus is idle until then."""
+        """Returns from when on a node may start, if the bus is idle until then."""
         if node in self._off:
             off = self._off[node]
             return self._recessive_from(off) + self._span(off.runs * _RECESSIVE)
         return self._suspended.get(node, _EVER)
 
     def _recessive_from(self, off: _Off) -> int:
-        # acknowledge delimiter, end of frame and interframe space are 11 bits, as are error delimiter and interframe
+        # The bus is recessive before it is free: acknowledge delimiter, end of frame and interframe space are 11 bits; error
+        # delimiter and interframe space are also 11.
         return max(off.from_ns, self._free_ns - self._span(_RECESSIVE))
 
     def _begin(self, start_ns: int) -> None:
@@ -266,14 +278,14 @@ class BusTime(BusModel):
         self._busy_ns += self._free_ns - start_ns
 
     def _note_start(self, start_ns: int) -> None:
-        """A frame starts: nodes that are off saw the bus idle until now, and nobody is suspended any more."""
+        """Notes that a frame starts: the idle time before counts for nodes that are bus-off, and suspension ends."""
         self._suspended.clear()
         for off in self._off.values():
             idle_ns = max(0, start_ns - self._recessive_from(off))
             off.runs -= idle_ns * self.bitrate // (_RECESSIVE * 1_000_000_000)
 
     def _pop(self, start_ns: int) -> _Waiting:
-        """Takes the first in the order of priority of those whose node may start."""
+        """Takes the first waiting frame whose node may start."""
         if not (self._off or self._suspended):
             return heappop(self._pending)
         aside = []
@@ -302,7 +314,7 @@ class BusTime(BusModel):
             self._suspended[node] = self._free_ns + self._span(_SUSPEND)
 
     def _count(self, time_ns: int, sender: int, destroyed: bool) -> None:
-        """Error counters after an attempt."""
+        """Updates all error counters after an attempt."""
         for node in sorted(self._nodes if destroyed else self._marked):
             if node in self._off:
                 continue
@@ -331,7 +343,7 @@ class BusTime(BusModel):
         self.events.append(BusEvent(time_ns, node, BusEventKind.OFF))
 
     def _recover(self, until_ns: int) -> None:
-        """Takes back what is no longer off by `until_ns`."""
+        """Ends bus-off for the nodes that have recovered by `until_ns`."""
         back = sorted((self._ready_ns(node), node) for node in self._off)
         for time_ns, node in back:
             if time_ns <= until_ns:

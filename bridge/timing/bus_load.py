@@ -1,9 +1,16 @@
-"""How full a real CAN bus would be: exact lengths of classic CAN frames, and the load they make. Pure.
+"""The exact lengths of classic CAN frames in bits, and the load that they make on a bus. Pure.
 
-A data frame with an 11-bit identifier and n data bytes is, in bits: start of frame 1, identifier 11, RTR, IDE and r0 1
-each, length code 4, data 8 n, CRC 15; then CRC delimiter, acknowledge slot and its delimiter 1 each, end of frame 7;
-then the 3 bits of interframe space. From the start to the end of the CRC the sender puts a bit of opposite value after
-five equal ones, and such stuff bits count as bits of the next run (ISO 11898-1).
+A data frame with an 11-bit identifier and n data bytes (ISO 11898-1):
+
+part                                                 bits
+start of frame                                       1
+identifier, RTR, IDE, r0                             11, 1, 1, 1
+length code, data, CRC                               4, 8 n, 15
+CRC delimiter, acknowledge slot and its delimiter    1, 1, 1
+end of frame, interframe space                       7, 3
+
+From the start of frame to the end of the CRC the sender inserts a stuff bit of opposite value after five equal bits. A stuff
+bit counts as the first bit of the next run.
 """
 
 from collections.abc import Sequence
@@ -11,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-_TAIL = 13  # delimiters, acknowledge, end of frame and interframe space: never stuffed
+_TAIL = 13  # bits after the CRC, which are never stuffed
 _BLOCK = 1024
 _POLYNOMIAL = 0x4599  # CRC-15: x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
 
@@ -27,14 +34,14 @@ def _crc_table() -> tuple[int, ...]:
 
 
 def _stuff_bit(state: int, bit: int) -> tuple[int, int]:
-    """The next state and the stuff bits added (0 or 1) when `bit` is sent; a state is 8 * last bit + length of run."""
+    """Returns the next state and the number of stuff bits (0 or 1) after `bit`; a state is 8 * last bit + length of its run."""
     last, run = divmod(state, 8)
     run = run + 1 if bit == last else 1
     return ((1 - bit) * 8 + 1, 1) if run == 5 else (bit * 8 + run, 0)
 
 
 def _stuff_table() -> dict[int, tuple[tuple[int, int], ...]]:
-    """For each state between two bytes and each byte: the next state, and the stuff bits added."""
+    """Returns for each state and each byte that is sent next: the state after it, and its number of stuff bits."""
     table = {}
     for state in [last * 8 + run for last in (0, 1) for run in (1, 2, 3, 4)]:
         row = []
@@ -71,21 +78,21 @@ def _check_length(length: int) -> None:
 
 
 def frame_bits(can_id: int, data: bytes, remote: bool = False) -> int:
-    """Bits that this very frame takes on the bus: stuffing as it really happens, and 3 bits of interframe space.
+    """Returns the bits that exactly this frame takes on the bus, its stuff bits and the interframe space included.
 
-    A remote frame has the RTR bit set and no data; its length code is taken to be 0.  Raises as `check_frame` does."""
+    A remote frame has the RTR bit set, no data, and a length code of 0.  Raises ValueError as `check_frame` does."""
     check_frame(can_id, data, remote)
-    # start of frame (0), identifier, RTR, IDE and r0 (0) and length code: 19 bits, here behind five zeros, which leave
-    # a CRC that starts with zero as it is
+    # Start of frame (0), identifier, RTR, IDE and r0 (0) and length code are 19 bits. Five zeros in front make them three
+    # bytes; they do not change a CRC that starts with zero.
     start = can_id << 7 | remote << 6 | len(data)
     head = start.to_bytes(3, "big")
     crc = 0
     for byte in head + data:
         crc = (crc << 8 & 0x7FFF) ^ _CRC[crc >> 7 ^ byte]
-    # all that is stuffed: 34 + 8 n bits, two of which come before the whole bytes
+    # 34 + 8 n bits are stuffed: two bits, then whole bytes
     length = 34 + 8 * len(data)
     bits = start << (length - 19) | int.from_bytes(data, "big") << 15 | crc
-    # start of frame is 0, then comes the identifier's highest bit: a run of one 1, or of two 0
+    # the two bits are the start of frame (0) and the highest bit of the identifier: a run of one 1, or a run of two 0
     state = 8 + 1 if bits >> (length - 2) else 2
     total = length + _TAIL
     table = _STUFF
@@ -96,7 +103,7 @@ def frame_bits(can_id: int, data: bytes, remote: bool = False) -> int:
 
 
 def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
-    """`frame_bits` of many frames of eight bytes at once, (n,): `data` is all their bytes, 8 n, one after the other.
+    """Returns `frame_bits` of n frames with eight bytes each, shape (n,); `data` is the 8 n bytes of all of them in a row.
 
     Raises ValueError for an identifier of more than 11 bits, or data of another length."""
     identifiers = np.array(can_ids, dtype=np.int64)
@@ -109,7 +116,7 @@ def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
     crc = np.zeros_like(head)
     for octet in (head >> 16, head >> 8 & 0xFF, head & 0xFF, *octets):
         crc = (crc << 8 & 0x7FFF) ^ _CRC_ARRAY[crc >> 7 ^ octet]
-    # The 96 bits after the first two, as 12 bytes: 17 of the head, 64 of data, 15 of the CRC.
+    # the 96 bits after the first two, as 12 bytes: 17 bits of the head, 64 of data, 15 of the CRC
     parts = (
         head >> 9 & 0xFF,
         head >> 1 & 0xFF,
@@ -125,7 +132,7 @@ def many_frame_bits(can_ids: Sequence[int], data: bytes) -> NDArray[np.int64]:
 
 
 class BitCount:
-    """Adds up the bits of frames.  Those with eight bytes are counted many at once, which is ten times cheaper."""
+    """The sum of the bits of many frames.  Frames with eight bytes are counted in blocks, which is ten times as fast."""
 
     __slots__ = ("_bits", "_data", "_ids")
 
@@ -135,7 +142,7 @@ class BitCount:
         self._data = bytearray()
 
     def add(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Takes a frame.  Raises ValueError for one that is none."""
+        """Adds a frame.  Raises ValueError as `check_frame` does."""
         if len(data) != 8 or remote:
             self._bits += frame_bits(can_id, data, remote)
             return
@@ -146,7 +153,7 @@ class BitCount:
 
     @property
     def bits(self) -> int:
-        """Of all frames so far, stuff bits and interframe space included."""
+        """The bits of all frames so far, stuff bits and interframe spaces included."""
         self._count()
         return self._bits
 
@@ -157,7 +164,7 @@ class BitCount:
 
 
 def worst_case_bits(length: int = 8) -> int:
-    """Bits of the longest frame with `length` data bytes: a stuff bit after the first five bits, then after every four.
+    """Returns the bits of the longest frame with `length` data bytes: stuff bits after the first five, then every four bits.
 
     Raises ValueError unless 0 <= length <= 8."""
     _check_length(length)
@@ -166,7 +173,7 @@ def worst_case_bits(length: int = 8) -> int:
 
 
 def bus_load(frames_per_second: float, bitrate: float, bits_per_frame: float = worst_case_bits(8)) -> float:
-    """The share of a bus of `bitrate` [bit/s] that the frames take: 1 is a full bus, more does not fit.
+    """Returns the share of a bus of `bitrate` [bit/s] that the frames take: 1 is a full bus, more does not fit.
 
     Raises ValueError unless the bit rate is positive."""
     if not bitrate > 0:

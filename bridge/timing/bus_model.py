@@ -1,6 +1,6 @@
-"""What a simulated CAN bus is to those who run it: frames and times in, frames with the instants they come at out.
+"""The interface of a simulated CAN bus: frames and instants in, frames with the instants of their delivery out.
 
-`bridge.timing.arbitration` and `bridge.timing.ideal_bus` have the buses.  Pure; instants are integer nanoseconds.
+The buses are in `bridge.timing.arbitration` and `bridge.timing.ideal_bus`.  Pure; instants are integer nanoseconds.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,9 @@ from echelon.bridge.protocols.frame import Frame
 
 
 class Delivered(NamedTuple):
-    """A frame that all others have: when it was put into its node's queue, and when its last bit was over."""
+    """A frame that all other nodes have received.
+
+    `queued_ns` is when its node queued it, `end_ns` the end of its last bit."""
 
     queued_ns: int
     end_ns: int
@@ -24,17 +26,17 @@ class BusEventKind(StrEnum):
     """What can happen to a node."""
 
     ERROR = "error"
-    """A frame of the node was destroyed; noted only where a bus is asked to"""
+    """A frame of the node was destroyed; only a bus with `note_errors` has this event"""
     PASSIVE = "error passive"
     ACTIVE = "error active"
-    """Error passive no longer"""
+    """The node is error active again after it was error passive"""
     OFF = "bus-off"
     RECOVERED = "recovered"
-    """Bus-off no longer; error counters at zero"""
+    """The node is no longer bus-off; its error counters are zero"""
 
 
 class BusEvent(NamedTuple):
-    """What happened to a node, and when; the identifier is of the frame that was destroyed."""
+    """An event at a node; `can_id` is the identifier of a destroyed frame."""
 
     time_ns: int
     node: int
@@ -44,34 +46,34 @@ class BusEvent(NamedTuple):
 
 @dataclass(slots=True)
 class Traffic:
-    """What became of the frames of one identifier; latency is from the queue to the end of the frame."""
+    """Counts of the frames with one identifier; latency is the time from the queue to the end of the frame."""
 
     sent: int = 0
     delivered: int = 0
     lost: int = 0
-    """Did not fit into the queue"""
+    """Frames that found the queue full, or were removed from it"""
     retransmitted: int = 0
-    """Attempts that were destroyed"""
+    """Attempts that were destroyed; each is repeated"""
     latency_sum_ns: int = 0
     latency_max_ns: int = 0
 
     @property
     def pending(self) -> int:
-        """Waiting, or on the bus."""
+        """Number of frames that wait or are on the bus."""
         return self.sent - self.delivered - self.lost
 
     @property
     def latency_mean_ns(self) -> float:
-        """Mean latency of what was delivered; 0 before."""
+        """Mean latency of the delivered frames [ns]; 0 before the first."""
         return self.latency_sum_ns / self.delivered if self.delivered else 0.0
 
     def expire(self) -> None:
-        """One that was delivered was too old to be of use: it counts as lost."""
+        """Counts a delivered frame as lost instead: it was too old to be of use."""
         self.delivered -= 1
         self.lost += 1
 
     def deliver(self, latency_ns: int) -> None:
-        """Counts one that was delivered."""
+        """Counts a delivered frame."""
         self.delivered += 1
         self.latency_sum_ns += latency_ns
         if latency_ns > self.latency_max_ns:
@@ -79,47 +81,48 @@ class Traffic:
 
 
 class BusModel(Protocol):
-    """A bus to simulate with.  Time never runs backwards over all calls; the first may have any time.
+    """A simulated bus.  Time must not run backwards from call to call; the first call may have any time.
 
-    To answer frames at the instant they come: run to the earliest of `due_ns` and what else is due, and send then."""
+    To answer a frame at the instant of its delivery, call `run` for the earlier of `due_ns` and the caller's next instant, then
+    `send` the answer."""
 
     events: list[BusEvent]
-    """What happened so far, in order of time."""
+    """All events so far, in order of time."""
 
     @property
     def traffic(self) -> Mapping[int, Traffic]:
-        """By identifier."""
+        """Counts by identifier."""
 
     @property
     def due_ns(self) -> int | None:
-        """Nothing is delivered earlier than this unless something is sent; None: nothing waits."""
+        """No frame is delivered before this instant unless another frame is sent; None: no frame waits."""
 
     @property
     def busy_ns(self) -> int:
-        """How long the bus was occupied so far, interframe spaces and destroyed frames included."""
+        """Time for which the bus was occupied so far [ns], interframe spaces and destroyed frames included."""
 
     @property
     def load(self) -> float:
-        """The share of the time since the first call that the bus was occupied."""
+        """Share of the time since the first call for which the bus was occupied."""
 
     def duration_ns(self, frame: Frame) -> int:
-        """From the start of a frame to its delivery.  Raises ValueError for a frame that is none."""
+        """Returns the time from the start of a frame to its delivery [ns].  Raises ValueError for an invalid frame."""
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
-        """Puts a frame into a node's queue; False: the queue is full, the frame is lost.
+        """Puts a frame into a node's queue.  Returns False if the queue is full and the frame is lost.
 
-        Raises ValueError for a time before the last call's, and for a frame that is none."""
+        Raises ValueError for a time before the last call's, and for an invalid frame."""
 
     def hear(self, time_ns: int, frame: Frame, end_ns: int) -> None:
-        """Takes note, at `time_ns`, of a frame of a node that is not in this model, which was over at `end_ns`: the bus was
-        taken then, or will be taken before frames of lower priority.
+        """Notes at `time_ns` a frame of another process, which was over at `end_ns` on the real bus.
 
-        Raises ValueError for a time before the last call's, and for a frame that is none."""
+        The model counts the bus as occupied by it: just before, if the bus was free; otherwise later, by priority.
+        Raises ValueError for a time before the last call's, and for an invalid frame."""
 
     def run(self, until_ns: int) -> list[Delivered]:
-        """Returns what was delivered up to `until_ns` and not returned before, in order of `end_ns`.
+        """Returns the frames that were delivered up to `until_ns` and not returned before, in order of `end_ns`.
 
-        What starts at `until_ns` itself is decided by the next call: frames sent at one instant compete together.
+        An attempt at `until_ns` itself starts with the next call only, so that all frames sent at that instant compete.
         Raises ValueError for a time before the last call's."""
 
     def set_error_rate(self, rate: float) -> None:
@@ -131,7 +134,7 @@ class BusModel(Protocol):
         """True if a node was off the bus at the last call's time."""
 
     def clear(self, node: int) -> int:
-        """Loses what waits in a node's queue, but not a frame that is on the bus; returns how many frames that were."""
+        """Empties a node's queue, except for a frame on the bus; returns the number of lost frames."""
 
     def bus_off(self, node: int) -> None:
-        """Takes a node off the bus at the last call's time; a frame of its own that is on the bus still gets through."""
+        """Makes a node bus-off at the last call's time.  A frame of the node that is on the bus is still delivered."""

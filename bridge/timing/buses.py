@@ -6,28 +6,28 @@ from echelon.bridge.frame_message import BRIDGE_NODE
 from echelon.bridge.protocols.frame import WHEELS
 from echelon.bridge.protocols.registry import DrivePlace, drive_places
 from echelon.bridge.reports import EVENTS, BusEvent, BusReport, IdentifierReport, ScheduledEvent
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_model import BusModel, Traffic
 from echelon.bridge.timing.ideal_bus import IdealBus
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 
 
-def make_buses(plan: Plan, part: int = 0) -> list[BusTime | IdealBus]:
-    """Returns the models of all buses.  Where several processes have models of the same buses, each is a `part` of its own
-    and draws errors of its own."""
+def make_buses(plan: Plan, part: int = 0) -> list[ArbitratedBus | IdealBus]:
+    """Returns the models of all buses.
+
+    Where several processes model the same buses, each process has its own number `part`, so that it draws its own errors."""
     can, count = plan.can, len(plan.can.buses)
     if can.timing == "ideal":
         return [IdealBus() for _ in range(count)]
     return [
-        BusTime(bus.bitrate, plan.seed, part * count + number, capacity=can.queue, restart_ns=can.restart_ns)
+        ArbitratedBus(bus.bitrate, plan.seed, part * count + number, capacity=can.queue, restart_ns=can.restart_ns)
         for number, bus in enumerate(can.buses)
     ]
 
 
 def bus_report(plan: Plan, number: int, model: BusModel, bounds_ns: Mapping[int, int | None]) -> BusReport:
-    """Returns what became of the frames on one bus; latencies [s] are from the queue to the end of the frame, and
-    their bounds those of the cyclic frames without errors."""
+    """Returns the report of bus `number`; `bounds_ns` are the worst-case response times of its cyclic frames."""
     bus, traffic = plan.can.buses[number], dict(sorted(model.traffic.items()))
     names = {place.node: _name(plan, place) for place in drive_places(plan)} | {BRIDGE_NODE: "bridge"}
     return BusReport(
@@ -50,7 +50,7 @@ def _name(plan: Plan, place: DrivePlace) -> str:
 
 
 def scheduled(plan: Plan) -> tuple[ScheduledEvent, ...]:
-    """Returns the plan's events, for people."""
+    """Returns the events of the plan in words."""
     rows = []
     for event in plan.events:
         robots = [plan.robots[robot].name for robot in event.robots]
@@ -72,7 +72,7 @@ def scheduled(plan: Plan) -> tuple[ScheduledEvent, ...]:
 
 
 def lost_report(plan: Plan, number: int, lost: Mapping[int, int]) -> BusReport:
-    """Returns the report of frames that were lost before they came to a bus, given by identifier."""
+    """Returns a report that holds only losses: frames that were lost before they came to a bus, counted by identifier."""
     identifiers = {f"{can_id:03X}": _identifier(Traffic(lost=count), None) for can_id, count in lost.items()}
     bus = plan.can.buses[number]
     return BusReport(bus.name, bus.bitrate, 0.0, lost=sum(lost.values()), identifiers=identifiers)

@@ -1,4 +1,4 @@
-"""What disturbs buses on schedule: error frames, and controllers that go bus-off."""
+"""The events of a scenario that disturb buses: error frames and bus-off."""
 
 from collections.abc import Sequence
 
@@ -11,8 +11,9 @@ from echelon.plan.plan import Plan
 
 
 class Disturbances:
-    """The scenario's events of these kinds, for models of the plan's buses; of the bridge's and the drives' controllers,
-    only those that the models have."""
+    """Applies the scenario's error frames and bus-offs to the models of the plan's buses.
+
+    `bridge` and `drives` say whether the models hold the controllers of the bridge and of the drives; others are left alone."""
 
     def __init__(self, plan: Plan, buses: Sequence[BusModel], *, bridge: bool = True, drives: bool = True) -> None:
         self._buses = buses
@@ -23,7 +24,7 @@ class Disturbances:
         self._places = drive_places(plan) if drives else []
 
     def apply(self, time_ns: int) -> None:
-        """Makes happen what is due at an instant, which is that of the models' last call."""
+        """Applies the events that begin or end by `time_ns`, which must be the time of the models' last call."""
         self._applied_ns = time_ns
         active, begun = self._schedule.at(time_ns)
         for number, bus in enumerate(self._buses):
@@ -43,6 +44,6 @@ class Disturbances:
 
     @property
     def due_ns(self) -> int:
-        """When something next begins or ends."""
+        """When the next event begins or ends [ns]."""
         next_ns = self._schedule.next_ns(self._applied_ns)
         return NEVER_NS if next_ns is None else next_ns

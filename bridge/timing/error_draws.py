@@ -1,7 +1,7 @@
-"""Which attempts to send are destroyed on a bus with errors: a function of seed, bus and the number of the attempt.
+"""Random draws: which attempts to send are destroyed on a bus with errors.  Pure.
 
-Draws come from Philox 4x64, keyed by seed and bus; their counter is the number of the attempt, so they do not depend on what
-was drawn before.  Pure.
+A draw is a function of seed, bus and number of the attempt only.  It comes from Philox 4x64: the key is made of seed and bus,
+the counter is the number of the attempt.
 """
 
 import hashlib
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.random import Philox
 
 INTERFRAME = 3
-"""Bits of recessive level after each frame"""
+"""Length of the interframe space [bits]"""
 _ECHO_MAX = 6
-_BLOCK = 512  # attempts that are drawn at a time; each takes one count of the Philox counter, which is four words
+_BLOCK = 512  # attempts drawn at once; each takes one step of the Philox counter, which gives four words
 
 
 class ErrorDraws:
@@ -25,9 +25,10 @@ class ErrorDraws:
         self._number = -1
 
     def hit(self, attempt: int, rate: float, bits: int) -> tuple[int, int] | None:
-        """Returns after how many of its `bits` an attempt is destroyed, and the bits of the echo; None if it gets through.
+        """Returns after how many bits an attempt of `bits` bits is destroyed, and the length of the error flag's echo [bits].
 
-        The last bit of the frame is safe: receivers have the frame by then."""
+        Returns None if it is not destroyed, which has probability 1 - `rate`.  The last bit of a frame is never destroyed: by
+        then receivers have the frame."""
         number, at = divmod(attempt, _BLOCK)
         if number != self._number:
             words = Philox(key=self._key, counter=number * _BLOCK).random_raw(4 * _BLOCK)

@@ -1,4 +1,4 @@
-"""Whether a plan's frames fit their buses, in the worst case; and if not, how they would.  Pure."""
+"""Whether the frames of a plan fit their buses in the worst case, and what would make them fit.  Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,8 +11,10 @@ from echelon.plan.plan import Plan
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How full a bus is at most, how long its identifiers wait at most [ns] (None: without bound, or longer than their
-    period), and, if that is too much, what would help."""
+    """The worst case of one bus.
+
+    `load` is its largest load (1 is full).  `responses_ns` are the worst-case response times by identifier; None: no bound, or
+    longer than the period.  `advice` says what would make the frames fit, if they do not."""
 
     bus: str
     bitrate: int
@@ -25,7 +27,7 @@ class Fit:
 
     @property
     def lines(self) -> list[str]:
-        """The verdict in one line, and one for each remedy."""
+        """A line that says whether the frames fit, then one line for each remedy."""
         speed = f"{self.bitrate / 1e6:g} Mbit/s" if self.bitrate >= 1_000_000 else f"{self.bitrate / 1e3:g} kbit/s"
         what = (
             f"{self.robots} robots, {self.identifiers} cyclic identifiers, {100 * self.load:.3g} % of {speed} at most"
@@ -39,7 +41,7 @@ class Fit:
 
 
 def robot_streams(plan: Plan, robot: int) -> list[Stream]:
-    """Returns the cyclic frames of a robot and its drives; of those only the torques where nobody answers."""
+    """Returns the cyclic frames of a robot and its drives.  On the mirrored path these are the torques alone."""
     one, closed = plan.robots[robot], plan.can.closed
     lengths = {message.frame_id: message.length for message in dbc_messages(one, "robot")}
     return [
@@ -49,7 +51,7 @@ def robot_streams(plan: Plan, robot: int) -> list[Stream]:
 
 
 def bus_fit(plan: Plan, bus: int) -> Fit:
-    """Returns how the plan's frames fit one of its buses."""
+    """Returns how the frames of a plan fit bus number `bus`."""
     robots = {robot.name: robot_streams(plan, robot.index) for robot in plan.robots if robot.drive.bus == bus}
     lengths = {message.frame_id: message.length for message in shared_messages(plan, bus)}
     shared = [
@@ -72,10 +74,10 @@ def bus_fit(plan: Plan, bus: int) -> Fit:
 
 
 def plan_fit(plan: Plan) -> list[Fit]:
-    """Returns how the plan's frames fit its buses."""
+    """Returns how the frames of a plan fit each of its buses."""
     return [bus_fit(plan, bus) for bus in range(len(plan.can.buses))]
 
 
 def describe_fit(plan: Plan) -> list[str]:
-    """Returns what `plan_fit` finds, in lines for people."""
+    """Returns the result of `plan_fit` as lines of text."""
     return [line for fit in plan_fit(plan) for line in fit.lines]

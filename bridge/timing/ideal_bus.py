@@ -1,4 +1,7 @@
-"""A bus that takes no time: what simulations without one, and real buses, which take their own, go through.  Pure."""
+"""A bus on which frames take no time.  Pure.
+
+It serves runs with `can.timing = "ideal"`, and runs on a wall clock, where the real bus takes its own time.
+"""
 
 from collections import defaultdict
 from collections.abc import Mapping

@@ -1,16 +1,16 @@
-"""How long frames wait on a CAN bus in the worst case, and how to make a set of frames fit.  Pure, integer nanoseconds.
+"""Worst-case response times of the frames on a CAN bus, and remedies for frames that do not fit.  Pure, integer nanoseconds.
 
-R. I. Davis, A. Burns, R. J. Bril, J. J. Lukkien, "Controller Area Network (CAN) schedulability analysis: Refuted,
-revisited and revised", 2007.  A frame that has started is not interrupted.  With C_k the longest time on the bus, T_k the
-period and J_k the jitter of stream k, hp and lp the streams of higher and of lower priority than m:
+After R. I. Davis, A. Burns, R. J. Bril, J. J. Lukkien, "Controller Area Network (CAN) schedulability analysis: Refuted,
+revisited and revised", 2007.  A frame that has started is not interrupted.  C_k is the longest time on the bus of stream k,
+T_k its period and J_k its jitter; hp and lp are the streams of higher and of lower priority than stream m:
 
     blocking      B   = max over lp of C_k
     busy period   L   = B + sum over hp and m of ⌈(L + J_k)/T_k⌉ C_k,  with ⌈(L + J_m)/T_m⌉ instances of m
     waiting       w_q = B + q C_m + sum over hp of ⌈(w_q + J_k + τ_bit)/T_k⌉ C_k    of instance q = 0, 1, …
     response      R   = max over q of J_m + w_q - q T_m + C_m
 
-each the least solution.  Responses are until the last bit of the frame, so here without the three bits of interframe
-space, as in `bridge.timing.arbitration`.  Every node is taken to send its most important frame first; bus errors are not in it.
+L and w_q are the least solutions.  A response ends with the last bit of the frame, without the three bits of interframe space,
+as in `bridge.timing.arbitration`.  Assumptions: every node sends its frame of highest priority first; there are no bus errors.
 """
 
 from bisect import bisect_left
@@ -23,16 +23,17 @@ from itertools import accumulate, chain
 from echelon.bridge.timing.bus_load import worst_case_bits
 
 BITRATES = (125_000, 250_000, 500_000, 800_000, 1_000_000)
-"""What classic CAN controllers usually offer [bit/s]"""
+"""Usual bit rates of classic CAN controllers [bit/s]"""
 _INTERFRAME = 3
 _LONGEST_STRETCH = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Frames of one identifier that come at least `period_ns` apart, give or take `jitter_ns` of delay in queueing.
+    """The frames of one identifier.
 
-    `bits` is the longest that one gets, interframe space included.  Raises ValueError for what cannot be."""
+    They are due at least `period_ns` apart and are queued up to `jitter_ns` after that.  `bits` is the length of the longest
+    frame, interframe space included.  Raises ValueError for a value that is too small."""
 
     can_id: int
     period_ns: int
@@ -47,19 +48,19 @@ class Stream:
 
 
 def load(streams: Sequence[Stream], bitrate: int) -> Fraction:
-    """The share of a bus of `bitrate` [bit/s] that the streams take at most: 1 is a full bus."""
+    """Returns the largest share of a bus of `bitrate` [bit/s] that the streams take: 1 is a full bus."""
     return sum((Fraction(_span(stream.bits, bitrate), stream.period_ns) for stream in streams), Fraction(0))
 
 
 def response_times(streams: Sequence[Stream], bitrate: int) -> dict[int, int | None]:
-    """The longest response of each identifier [ns], from when it should be queued (jitter included) to its last bit.
+    """Returns the worst-case response time of each identifier [ns]: from the instant at which it is due to its last bit.
 
-    None: there is no bound, since what goes first fills the bus, or it exceeds the period.
+    None means: it exceeds the period, or there is no bound since streams of higher priority fill the bus.
     Raises ValueError if two streams have the same identifier."""
     order = sorted(streams, key=lambda stream: stream.can_id)
     spans = [_span(stream.bits, bitrate) for stream in order]
     blocking = [*accumulate(reversed(spans), max, initial=0)][-2::-1]
-    higher: Counter[tuple[int, int]] = Counter()  # time on the bus by period and jitter: those come together
+    higher: Counter[tuple[int, int]] = Counter()  # time on the bus, summed over streams of equal period and jitter
     found: dict[int, int | None] = {}
     used = Fraction(0)
     for stream, span, blocked in zip(order, spans, blocking, strict=True):
@@ -72,7 +73,7 @@ def response_times(streams: Sequence[Stream], bitrate: int) -> dict[int, int | N
 
 
 def fits(streams: Sequence[Stream], bitrate: int) -> bool:
-    """True if every frame is through within its period, however the streams fall together."""
+    """Returns whether every frame is delivered within its period in the worst case."""
     return load(streams, bitrate) < 1 and None not in response_times(streams, bitrate).values()
 
 
@@ -81,7 +82,7 @@ def _span(bits: int, bitrate: int) -> int:
 
 
 def _response(own: Stream, blocking: int, higher: Mapping[tuple[int, int], int], bitrate: int) -> int | None:
-    """The longest response of a stream, None if over its period; the bus must not be full."""
+    """Returns the worst-case response time of a stream, None if it exceeds the period; the bus must not be full."""
     period, jitter = own.period_ns, own.jitter_ns
     length, bit = _span(own.bits, bitrate), _span(1, bitrate)
 
@@ -100,7 +101,7 @@ def _response(own: Stream, blocking: int, higher: Mapping[tuple[int, int], int],
 
 
 def _least(base: int, growing: Callable[[int], int], start: int) -> int:
-    """The least value that is `base` + `growing` of itself; none is less than `start`."""
+    """Returns the least x with x = `base` + `growing`(x), which must be known to be at least `start`."""
     value = max(base, start)
     while (following := base + growing(value)) != value:
         value = following
@@ -109,25 +110,25 @@ def _least(base: int, growing: Callable[[int], int], start: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Remedies:
-    """Ways to make a set fit, each by itself; None where it does not help."""
+    """Remedies for a set of frames that does not fit.  Each is enough by itself; None: this remedy does not help."""
 
     buses: tuple[tuple[str, ...], ...] | None
-    """The fewest buses, each with its robots, which keep their order"""
+    """The robots of each bus, over as few buses as possible, in the given order"""
     stretch: int | None
-    """The smallest whole number of times that each robot's shortest period must be as long"""
+    """The smallest whole factor by which each robot's shortest period must be multiplied"""
     bitrate: int | None
-    """The lowest usual bit rate [bit/s]"""
+    """The lowest sufficient of the usual bit rates [bit/s]"""
 
 
 def remedies(robots: Mapping[str, Sequence[Stream]], bitrate: int, shared: Sequence[Stream] = ()) -> Remedies:
-    """Returns what would make the robots' streams fit; `shared` are streams that every bus has, whoever is on it."""
+    """Returns what would make the robots' streams fit; `shared` are streams that every bus has."""
 
     def fit(names: Sequence[str], rate: int = bitrate, stretch: int = 1) -> bool:
         groups = [shared, *(robots[name] for name in names)]
         return fits(list(chain.from_iterable(_stretched(group, stretch) for group in groups)), rate)
 
     names = list(robots)
-    # what fits does so with longer periods, too
+    # a set that fits still fits with longer periods, so bisection finds the smallest factor
     stretch = 1 + bisect_left(range(1, _LONGEST_STRETCH + 1), True, key=lambda times: fit(names, stretch=times))
     return Remedies(
         _split(names, fit),
@@ -137,9 +138,9 @@ def remedies(robots: Mapping[str, Sequence[Stream]], bitrate: int, shared: Seque
 
 
 def advice(robots: Mapping[str, Sequence[Stream]], bitrate: int, shared: Sequence[Stream] = ()) -> list[str]:
-    """Returns how to make the robots' streams fit one bus of `bitrate`, a line for each way; none if they fit.
+    """Returns one line for each remedy that makes the robots' streams fit a bus of `bitrate`; no lines if they fit already.
 
-    If no way helps, one line says that."""
+    If no remedy helps, one line says so."""
     if fits([*shared, *chain.from_iterable(robots.values())], bitrate):
         return []
     ways = remedies(robots, bitrate, shared)
@@ -157,7 +158,7 @@ def advice(robots: Mapping[str, Sequence[Stream]], bitrate: int, shared: Sequenc
 
 
 def _split(names: Sequence[str], fit: Callable[[Sequence[str]], bool]) -> tuple[tuple[str, ...], ...] | None:
-    """Fills one bus after the other, then evens them out if they still fit."""
+    """Fills one bus after the other, then spreads the robots evenly if they still fit."""
     buses: list[list[str]] = [[]]
     for name in names:
         if fit([*buses[-1], name]):

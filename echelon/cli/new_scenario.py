@@ -211,7 +211,7 @@ avoidance_radius = 0.32
 sensing_radius = 0.6
 force_limit = 20.0
 
-# Delay and loss, to try what they do (`echelon analyse` says how much delay the law bears):
+# Delay and loss, to try what they do (`echelon analyse` says how much delay may be):
 # [[links]]
 # channel = "state"
 # delay = 0.05

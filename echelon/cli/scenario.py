@@ -1,20 +1,15 @@
-"""Commands about scenarios: `scenarios`, `new`, `validate`, `analyse`, `dbc`, `schema`."""
+"""Commands about scenarios: `scenarios`, `new`, `validate`, `dbc`, `schema`; `analyse` has a module of its own."""
 
 import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
+from echelon.cli.analyse import ANALYSE
 from echelon.cli.options import Command, argument, option
 from echelon.cli.shared import JSON, ScenarioOptions
 from echelon.errors import UsageError
-
-if TYPE_CHECKING:
-    from echelon.plan.plan import Plan
-
-LONGEST_DELAY: Final = 500
-"""`echelon analyse` looks for the largest stable delay up to so many ticks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,14 +87,15 @@ def new(options: NewOptions) -> int:
 class ValidateOptions(ScenarioOptions):
     """Options of `echelon validate`."""
 
+    strict: bool = field(default=False, metadata=option("warnings count as mistakes: exit code 2"))
     json: bool = field(default=False, metadata=JSON)
 
 
 def validate(options: ValidateOptions) -> int:
-    """Checks a scenario and says what it means."""
+    """Checks a scenario, says what it means, and warns of what is hardly meant."""
     from echelon.bridge.timing.fit import describe_fit
     from echelon.cli.scenario_file import read_scenario
-    from echelon.sim.results.beforehand import beforehand
+    from echelon.sim.forecast.warnings import warnings
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
     facts: dict[str, Any] = {
@@ -110,76 +106,20 @@ def validate(options: ValidateOptions) -> int:
         "ticks": plan.duration_ns // plan.robots[0].period_ns,
         "time_scales": {block.name: block.sigma for block in plan.blocks},
         "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
-        "notes": list(beforehand(plan)),
+        "warnings": warnings(plan),
     }
+    code = 2 if options.strict and facts["warnings"] else 0
     if options.json:
-        print(json.dumps(facts, indent=2))
-        return 0
+        print(json.dumps(facts, indent=2, ensure_ascii=False))
+        return code
     print(f"{options.scenario}: valid")
     print(f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks")
     print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
     for line in facts["can"]:
         print(f"  CAN  {line}")
-    for line in facts["notes"]:
-        print(f"  note {line}")
-    return 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnalyseOptions(ScenarioOptions):
-    """Options of `echelon analyse`."""
-
-    json: bool = field(default=False, metadata=JSON)
-
-
-def analyse(options: AnalyseOptions) -> int:
-    """Computes how much delay a scenario's law bears; 1 if it is unstable without any."""
-    from echelon.cli.scenario_file import read_scenario
-    from echelon.controller.prediction.sampled import largest_stable_delay, spectral_radius
-
-    _, plan = read_scenario(options.scenario, options.overrides)
-    period_s = plan.root.period_ns / 1e9
-    try:
-        largest = largest_stable_delay(plan, LONGEST_DELAY)
-        radii = {k: spectral_radius(plan, k) for k in ((0,) if largest is None else (largest, largest + 1))}
-    except ValueError as error:
-        raise UsageError(f"{options.scenario}: {error}") from None
-    margins = _margins(plan)
-    if options.json:
-        facts = {
-            "scenario": plan.name,
-            "period": period_s,
-            "blocks": margins,
-            "largest_stable_delay": None if largest is None else largest * period_s,
-            "spectral_radius": radii,
-        }
-        print(json.dumps(facts, indent=2))
-        return 0 if largest is not None else 1
-    print(f"{plan.name}: how old robots' states may be when their leaders use them")
-    for name, row in margins.items():
-        margin_ms = f"{1e3 * row['delay_margin']:.4g} ms"
-        print(f"  {name:<12} σ {row['sigma']:<6.4g} s   margin of the block alone, in continuous time: {margin_ms}")
-    how = f"all blocks together, sampled and held for {1e3 * period_s:g} ms"
-    if largest is None:
-        print(f"  {how}: unstable without any delay")
-        return 1
-    print(f"  {how}: stable up to {largest} ticks, {1e3 * largest * period_s:g} ms")
-    for k, radius in radii.items():
-        print(f"    {k} ticks: spectral radius {radius:.6f}, {'settles' if radius < 1 else 'does not settle'}")
-    return 0
-
-
-def _margins(plan: "Plan") -> dict[str, dict[str, float]]:
-    """Returns each block's time scale [s] and how much delay it bears alone, in continuous time [s]."""
-    from echelon.controller.prediction.sampled import delay_margin, linear_gains
-
-    margins = {}
-    for block in plan.blocks:
-        if block.size:
-            gains = linear_gains(plan, block, 0.0)
-            margin = delay_margin(*(float(matrix[0, 0]) for matrix in (gains.K_1, gains.K_2, gains.K_i)))
-            margins[block.name] = {"sigma": block.sigma, "delay_margin": margin}
-    return margins
+    for line in facts["warnings"]:
+        print(f"  warning  {line}")
+    return code
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -269,29 +209,18 @@ what each part is for.  Then change it: `echelon validate NAME.toml` says what i
         work=validate,
         about="""\
 Checks a scenario.  Says what it means: robots, duration, time scales, whether its frames fit
-its CAN buses; or all that is wrong with it, a line each: key, value, and what is allowed.""",
+its CAN buses; or all that is wrong with it, a line each: key, value, and what is allowed.
+Warns, a line each, of what is allowed but hardly meant: time scales near the period, more
+torque or speed than robots have, claims beyond the end, delays that act as longer ones.""",
         examples={
             "echelon validate lab": "a shipped scenario",
             "echelon validate my.toml --set law.lead=0.5": "a file with one value changed",
+            "echelon validate my.toml --strict": "fails if there is a warning",
             "echelon validate runs/demo --json": "the scenario of a run, for scripts",
         },
-        codes={0: "valid"},
+        codes={0: "valid", 2: "wrong; with --strict also: there are warnings"},
     ),
-    Command(
-        name="analyse",
-        options=AnalyseOptions,
-        work=analyse,
-        about="""\
-Computes how old robots' states may be when their leaders use them before the formation does
-not settle any more: each block alone in continuous time, and exactly, all blocks together as
-the law is sampled and held.""",
-        examples={
-            "echelon analyse paper": "stable up to 6 ticks of 1 ms",
-            "echelon analyse paper --set law.lead=0.0": "the paper's law as it stands",
-            "echelon analyse lab --json": "for scripts",
-        },
-        codes={0: "stable, with some delay or none", 1: "unstable without any delay"},
-    ),
+    ANALYSE,
     Command(
         name="dbc",
         options=DbcOptions,

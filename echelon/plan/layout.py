@@ -60,7 +60,7 @@ class Carried(NamedTuple):
 
     child: int
     """Number of the child"""
-    said: slice
+    there: slice
     """Place in the child's message"""
     here: slice
     """Place in the node's message"""
@@ -162,37 +162,39 @@ def length(part: slice) -> int:
     return int(part.stop - part.start)
 
 
-def says(plan: Plan, one: RobotPlan | NodePlan | BusRolePlan) -> dict[Channel, int | None]:
+def message_sizes_of(plan: Plan, one: RobotPlan | NodePlan | BusRolePlan) -> dict[Channel, int | None]:
     """Returns the channels on which a role sends, with the number of values of the messages; None if it varies (frames)."""
     if isinstance(one, RobotPlan):
         state: dict[Channel, int | None] = {Channel.STATE: len(STATE_FIELDS)}
         return state | {Channel.TORQUE: len(TORQUE_FIELDS)} if plan.can.closed else state
     if isinstance(one, NodePlan):
         layout = NodeLayout.of(plan, one)
-        said = {
+        layouts = {
             Channel.GROUP_STATE: None if one.parent is None else layout.state,
             Channel.REFERENCE: layout.reference,
             Channel.COMMAND: layout.command,
         }
-        return {channel: each.size for channel, each in said.items() if each is not None}
+        return {channel: each.size for channel, each in layouts.items() if each is not None}
     frames: dict[Channel, int | None] = {Channel.FRAMES: None}
     return frames | {Channel.WHEELS: 2 * len(plan.robots)} if one.role == "bridge" else frames
 
 
-def said_by(plan: Plan) -> dict[tuple[int, Channel], int | None]:
+def message_sizes(plan: Plan) -> dict[tuple[int, Channel], int | None]:
     """Returns the number of values of all messages of a run, by source and channel; None if it varies.
 
     Where torque is mirrored, the bridge is not a role of the plan.  It sends frames with the index after that of the last
     node."""
-    found = {(one.index, channel): size for one in plan.all_roles for channel, size in says(plan, one).items()}
+    found = {
+        (one.index, channel): size for one in plan.all_roles for channel, size in message_sizes_of(plan, one).items()
+    }
     if not plan.can.closed:
         found[len(plan.formation), Channel.FRAMES] = None
     return found
 
 
-def sized(plan: Plan) -> Plan:
+def with_message_sizes(plan: Plan) -> Plan:
     """Returns a plan in which each link has the number of values of its messages (`LinkPlan.size`)."""
-    sizes = said_by(plan)
+    sizes = message_sizes(plan)
     return replace(plan, links=tuple(replace(link, size=sizes[link.source, link.channel]) for link in plan.links))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from echelon.errors import Mistakes
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan, EventPlan
-from echelon.plan.layout import sized
+from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import (
     COORDINATOR,
     AvoidancePlan,
@@ -94,7 +94,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         events=events,
         bus_roles=bus_roles,
     )
-    return sized(plan)
+    return with_message_sizes(plan)
 
 
 def _duration_ns(scenario: Scenario, root: NodePlan) -> int:

@@ -16,10 +16,10 @@ from echelon.plan.plan import LinkPlan, Plan
 from echelon.role import Input, Role
 from echelon.runtime.link import Link, LinkCounts
 
-LEAD: Final = 32
+MAX_AHEAD: Final = 32
 """Number of periods by which a role in a lockstep may be ahead of any of its sources.  On a link with delay or loss a role
 needs no new messages for a while; without this limit it would run far ahead, and its messages would pile up at its sources."""
-SLACK: Final = 4 * LEAD
+SLACK: Final = 4 * MAX_AHEAD
 """Number of messages that an input holds beyond those in flight before it removes messages that its link loses."""
 
 
@@ -31,7 +31,7 @@ class _Slot:
     plan: LinkPlan
     capacity: int
     """If `newer` holds more messages than this, some of them are lost ones, and these are removed"""
-    lead_ns: int | None
+    ahead_ns: int | None
     """How far the role may be ahead of the newest message that has come, even if the link loses that message.  None: no limit;
     so on an ideal link, where the role waits for every message anyway"""
     current: Message | None = None
@@ -45,7 +45,7 @@ class _Slot:
 
 
 class Mailbox:
-    """All inputs of one role.  With `paced`, a link also counts as missing while the role is `LEAD` periods ahead of its
+    """All inputs of one role.  With `paced`, a link also counts as missing while the role is `MAX_AHEAD` periods ahead of its
     source."""
 
     def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
@@ -56,7 +56,7 @@ class Mailbox:
                 Link(link, plan.seed, names[link.source], names[role.index]),
                 link,
                 2 * (link.delay_max_ns // link.period_ns) + SLACK,
-                max(LEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
+                max(MAX_AHEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
                 if paced and not link.ideal
                 else None,
             )
@@ -90,7 +90,7 @@ class Mailbox:
             link = slot.link
             number = link.newest(time_ns)
             if (number > slot.in_use and number not in slot.newer) or (
-                slot.lead_ns is not None and link.sent_ns(slot.newest) < time_ns - slot.lead_ns
+                slot.ahead_ns is not None and link.sent_ns(slot.newest) < time_ns - slot.ahead_ns
             ):
                 waiting.append(link)
         return waiting

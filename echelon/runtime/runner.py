@@ -6,7 +6,7 @@ wakes only for work that may block, which is sending batches of copies, and for 
 
 Zenoh's thread also sends, so it must never block.  It does not wait for the main thread: messages that come while the main
 thread moves the role are put aside, and the main thread takes them.  It does not wait for room to put a message:
-`mailbox.LEAD` bounds the messages on their way to a receiver that reads nothing, and a session has room for 128 KiB.
+`mailbox.MAX_AHEAD` bounds the messages on their way to a receiver that reads nothing, and a session has room for 128 KiB.
 
 On a wall clock the main thread also wakes at each instant and each deadline.  A stage whose deadline has come runs with the
 newest messages that have come, and is counted as late if one was missing.

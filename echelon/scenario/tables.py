@@ -186,7 +186,7 @@ class Law(Table):
     """Parameters of the law that `use` names"""  # validation turns them into the law itself, a Part
     time_scales: Literal["three", "multi"] = "three"
     """`three`: one time scale for each layer of the tree.  `multi`: one for each node; the groups settle in their order"""
-    epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.1, 0.1]
+    epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.7, 0.7]
     """ε_1, ε_2, …: the time scale σ of a block is the product of the first few.  `three` needs as many as the tree has layers
     of nodes, `multi` as many as there are nodes: the groups and the formation"""
     gains: list[Gains] = []

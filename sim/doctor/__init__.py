@@ -1,1 +1,1 @@
-"""What this machine can do, and whether a scenario fits it."""
+"""Checks of this machine, and of whether a scenario fits it."""

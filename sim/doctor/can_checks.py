@@ -1,4 +1,4 @@
-"""What this machine can do about CAN: the checks of `echelon doctor` of buses, interfaces, and programs to look at them."""
+"""The CAN checks of `echelon doctor`: buses, interfaces, and tools."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from typing import Any, Final
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
 from echelon.plan.plan import Plan
-from echelon.sim.doctor.finding import LIMIT_S, Finding
+from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
 
 SHORT_QUEUE: Final = 100
 NET: Final = Path("/sys/class/net")
@@ -20,31 +20,31 @@ _CAN_TYPE: Final = "280"  # ARPHRD_CAN of linux/if_arp.h
 _TOOLS: Final = f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}:/usr/local/sbin:/usr/sbin:/sbin"
 
 
-def check_vcan(name: str = "vcan0") -> Finding:
-    """The virtual interface that runs look for first, or the commands to get it."""
+def check_vcan(name: str = "vcan0") -> Diagnosis:
+    """Checks for the virtual interface that runs use first; the advice is how to get it."""
     if interface_is_up(name):
-        return Finding(name, "ok", "is up: frames go there, `candump vcan0` shows them")
+        return Diagnosis(name, "ok", "is up: frames go there, `candump vcan0` shows them")
     if (NET / name).exists():
-        return Finding(name, "note", "is there, but down", (f"sudo ip link set {name} up",))
+        return Diagnosis(name, "note", "is there, but down", (f"sudo ip link set {name} up",))
     if vcan_module():
         more = "sudo modprobe vcan; " if not Path("/sys/module/vcan").exists() else ""
         made = f"sudo ip link add {name} type vcan; sudo ip link set {name} up txqueuelen 1000"
-        return Finding(name, "note", "not there; the kernel can have it", (more + made,))
+        return Diagnosis(name, "note", "not there; the kernel can have it", (more + made,))
     guest = "deploy/vcan.sh COMMAND, which runs it in a guest that has one"
     if not shutil.which("linux.uml", path=_TOOLS):
         guest += " (apt-get install user-mode-linux busybox-static iproute2)"
-    return Finding(name, "note", "not there, and this kernel has no module vcan", ("use udp_multicast, or", guest))
+    return Diagnosis(name, "note", "not there, and this kernel has no module vcan", ("use udp_multicast, or", guest))
 
 
 def vcan_module() -> bool:
-    """Whether the kernel has vcan, or could load it."""
+    """Returns whether the kernel has vcan or can load it."""
     if Path("/sys/module/vcan").exists():
         return True
     return _output("modprobe", "--dry-run", "--quiet", "vcan") is not None
 
 
 def _output(program: str, *arguments: str) -> str | None:
-    """Returns what a command prints; None if it is not there, or fails."""
+    """Returns the output of a command; None if it is missing or fails."""
     try:
         command = [shutil.which(program, path=_TOOLS) or program, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S / 2, check=False)
@@ -53,8 +53,8 @@ def _output(program: str, *arguments: str) -> str | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def check_multicast() -> Finding:
-    """A frame from one bus to another over multicast, which is where frames go without vcan0."""
+def check_multicast() -> Diagnosis:
+    """Checks that a frame gets through over multicast, which runs use without vcan0."""
     url = resolve_url("udp_multicast:") if interface_is_up("vcan0") else resolve_url("auto")
     advice = ("sudo ip link set lo multicast on; sudo ip route add 224.0.0.0/4 dev lo",)
     try:
@@ -65,15 +65,15 @@ def check_multicast() -> Finding:
             took_us = (time.perf_counter() - begun_s) * 1e6
             error = sender.error or receiver.error or "it did not come"
     except OSError as cannot:
-        return Finding("multicast", "note", str(cannot), advice)
+        return Diagnosis("multicast", "note", str(cannot), advice)
     if frame is None or (frame.can_id, frame.data) != (0x123, b"doctor"):
-        return Finding("multicast", "note", f"a frame on {url}: {error}", advice)
-    return Finding("multicast", "ok", f"a frame on {url} came, after {took_us:.0f} µs")
+        return Diagnosis("multicast", "note", f"a frame on {url}: {error}", advice)
+    return Diagnosis("multicast", "ok", f"a frame on {url} came, after {took_us:.0f} µs")
 
 
-def check_interfaces(net: Path = NET) -> list[Finding]:
-    """CAN interfaces besides vcan0: bit rate, state and queue."""
-    findings = []
+def check_interfaces(net: Path = NET) -> list[Diagnosis]:
+    """Checks bit rate, state and queue of all CAN interfaces except vcan0."""
+    results = []
     for path in sorted(net.glob("*")):
         try:
             is_can = (path / "type").read_text().strip() == _CAN_TYPE
@@ -81,12 +81,12 @@ def check_interfaces(net: Path = NET) -> list[Finding]:
         except (OSError, ValueError):
             continue
         if is_can:
-            findings.append(_interface(path.name, queue, _link(path.name)))
-    return findings
+            results.append(_interface(path.name, queue, _link(path.name)))
+    return results
 
 
 def _link(name: str) -> dict[str, Any]:
-    """Returns what `ip` knows of an interface; nothing if it is not there, or odd."""
+    """Returns the details of an interface from `ip`; empty if it is missing or the output is not understood."""
     try:
         rows = json.loads(_output("ip", "-details", "-json", "link", "show", "dev", name) or "[]")
         return dict(rows[0]) if rows else {}
@@ -94,7 +94,7 @@ def _link(name: str) -> dict[str, Any]:
         return {}
 
 
-def _interface(name: str, queue: int, link: dict[str, Any]) -> Finding:
+def _interface(name: str, queue: int, link: dict[str, Any]) -> Diagnosis:
     info = link.get("linkinfo", {})
     data = info.get("info_data", {})
     parts, advice = [str(info.get("info_kind", "CAN"))], []
@@ -112,27 +112,29 @@ def _interface(name: str, queue: int, link: dict[str, Any]) -> Finding:
     elif state in ("ERROR-PASSIVE", "ERROR-WARNING"):
         advice.append("frames are disturbed or not acknowledged: look at wiring, termination and bit rate")
     parts.append(f"queue of {queue} frames")
-    if queue < SHORT_QUEUE and not name.startswith("vcan"):  # vcan has no queue: it is never full
+    if queue < SHORT_QUEUE and not name.startswith("vcan"):  # a vcan has no queue that could be full
         advice.append(f"a burst fills it: sudo ip link set {name} txqueuelen 1000")
-    return Finding(name, "note" if advice else "ok", ", ".join(parts), tuple(advice))
+    return Diagnosis(name, "note" if advice else "ok", ", ".join(parts), tuple(advice))
 
 
-def check_tools() -> Finding:
-    """Programs to look at a bus with; nothing here needs them."""
+def check_tools() -> Diagnosis:
+    """Checks for tools that show a bus; no run needs them."""
     packages = {"candump": "can-utils", "cansend": "can-utils", "ip": "iproute2", "cantools": "python3-cantools"}
     found = [name for name in packages if shutil.which(name, path=_TOOLS)]
     if len(found) < len(packages):
         wanted = " ".join(sorted({package for name, package in packages.items() if name not in found}))
-        return Finding("CAN tools", "note", f"there: {', '.join(found) or 'none'}", (f"sudo apt-get install {wanted}",))
-    return Finding("CAN tools", "ok", ", ".join(found))
+        return Diagnosis(
+            "CAN tools", "note", f"there: {', '.join(found) or 'none'}", (f"sudo apt-get install {wanted}",)
+        )
+    return Diagnosis("CAN tools", "ok", ", ".join(found))
 
 
-def check_fit(plan: Plan) -> list[Finding]:
-    """Whether the plan's frames fit its buses."""
+def check_fit(plan: Plan) -> list[Diagnosis]:
+    """Checks whether the frames of a plan fit its buses."""
     from echelon.bridge.timing.fit import plan_fit
 
-    findings = []
+    results = []
     for fit in plan_fit(plan):
         first, *rest = fit.lines
-        findings.append(Finding(f"bus {fit.bus}", "ok" if fit.fits else "problem", first, tuple(map(str.strip, rest))))
-    return findings
+        results.append(Diagnosis(f"bus {fit.bus}", "ok" if fit.fits else "problem", first, tuple(map(str.strip, rest))))
+    return results

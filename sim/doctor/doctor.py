@@ -1,6 +1,6 @@
-"""What this machine can do: `echelon doctor`.  Each check really tries what a run needs, and says what to do where it fails.
+"""`echelon doctor`: checks of this machine.  Each check really tries what a run needs, and gives advice if that fails.
 
-Nothing here needs root, changes the machine, or takes longer than its time limit.
+No check needs root, changes the machine, or takes longer than its time limit.
 """
 
 import importlib.metadata
@@ -21,37 +21,37 @@ import numpy as np
 from echelon.plan.plan import Plan
 from echelon.runtime.session import Session, loopback_endpoints
 from echelon.sim.doctor.can_checks import check_fit, check_interfaces, check_multicast, check_tools, check_vcan
-from echelon.sim.doctor.finding import LIMIT_S, Finding
+from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
 
 PACKAGES: Final = ("eclipse-zenoh", "python-can", "numpy", "scipy", "cantools", "mcap", "pydantic")
 OLDEST: Final = (3, 11)
 SLEEPS: Final = 200
 SLEEP_S: Final = 0.001
 LATE_S: Final = 0.002
-"""Who is woken later than this cannot keep periods of a few milliseconds."""
+"""A process that is woken later than this cannot keep periods of a few milliseconds [s]"""
 BUFFER: Final = 4 << 20
-"""What the bridge asks for, to hold a burst while it waits for its turn [bytes]"""
+"""The size of socket buffer that the bridge asks for, which holds a burst while it waits for a processor [bytes]"""
 SPACE: Final = 1 << 30
-"""Fewer free bytes are soon full of recordings"""
+"""Recordings soon fill less free space than this [bytes]"""
 BUSY: Final = 0.6
-"""Share of the processors above which work piles up behind deadlines"""
+"""The load of the processors above which runs miss deadlines; 1 is all of them"""
 HANDLING: Final = 2.0
-"""What a message costs the processes at its ends and the recorder, in times of its way there and back: paper.toml with
-recorder and CAN keeps two processors busy for 1.3 ms per tick of 24 messages"""
+"""Processor time that a message costs sender, receiver and recorder, as a multiple of its measured round trip.  Measured:
+paper.toml with recorder and CAN takes two processors 1.3 ms for a tick of 24 messages"""
 
 
 @dataclass(slots=True)
 class Measured:
-    """What checks measured that others need."""
+    """Measurements of some checks that later checks use."""
 
     jitter_s: float = 0.0
     round_trip_s: float = 0.0
 
 
-def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Finding]:
-    """Makes all checks, those of a plan too if there is one; `folder` is where recordings would go."""
+def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Diagnosis]:
+    """Makes all checks and returns their results; `folder` is the place of recordings.  A `plan` adds its own checks."""
     measured = Measured()
-    checks: list[tuple[str, Callable[[], Finding]]] = [
+    checks: list[tuple[str, Callable[[], Diagnosis]]] = [
         ("Python", check_python),
         ("processors", check_processors),
         ("waking", lambda: check_waking(measured)),
@@ -62,47 +62,47 @@ def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Findin
         ("CAN tools", check_tools),
         ("disk", lambda: check_disk(folder or Path())),
     ]
-    findings = [_limited(what, check) for what, check in checks]
-    findings += check_interfaces()
-    if {finding.what for finding in findings if finding.state != "ok"} >= {"vcan0", "multicast"}:
-        findings.append(Finding("CAN bus", "problem", "neither vcan0 nor multicast: frames reach no other process"))
+    results = [_limited(what, check) for what, check in checks]
+    results += check_interfaces()
+    if {result.what for result in results if result.state != "ok"} >= {"vcan0", "multicast"}:
+        results.append(Diagnosis("CAN bus", "problem", "neither vcan0 nor multicast: frames reach no other process"))
     if plan is not None:
         if plan.can.enabled:
-            findings += check_fit(plan)
-        findings.append(_limited("wall clock", lambda: check_wall_clock(plan, measured)))
-    return findings
+            results += check_fit(plan)
+        results.append(_limited("wall clock", lambda: check_wall_clock(plan, measured)))
+    return results
 
 
-def text(findings: list[Finding]) -> str:
-    """Returns findings as lines for a terminal, and a verdict."""
-    width = max(len(finding.what) for finding in findings)
+def text(results: list[Diagnosis]) -> str:
+    """Returns results as lines for a terminal, with a verdict at the end."""
+    width = max(len(result.what) for result in results)
     lines = []
-    for finding in findings:
-        lines.append(f"{finding.state:<7}  {finding.what:<{width}}  {finding.text}")
-        lines += [f"{'':<{width + 9}}  → {advice}" for advice in finding.advice]
-    problems = [finding.what for finding in findings if finding.state == "problem"]
+    for result in results:
+        lines.append(f"{result.state:<7}  {result.what:<{width}}  {result.text}")
+        lines += [f"{'':<{width + 9}}  → {advice}" for advice in result.advice]
+    problems = [result.what for result in results if result.state == "problem"]
     lines.append(f"NOT USABLE: {', '.join(problems)}" if problems else "usable")
     return "\n".join(lines)
 
 
-def _limited(what: str, check: Callable[[], Finding]) -> Finding:
-    """Makes a check in a thread of its own, so that none can hang the others."""
-    found: list[Finding] = []
+def _limited(what: str, check: Callable[[], Diagnosis]) -> Diagnosis:
+    """Makes a check in a separate thread, so that a hanging check does not stop the others."""
+    found: list[Diagnosis] = []
 
     def run() -> None:
         try:
             found.append(check())
         except Exception as error:
-            found.append(Finding(what, "problem", f"{type(error).__name__}: {error}"))
+            found.append(Diagnosis(what, "problem", f"{type(error).__name__}: {error}"))
 
     thread = threading.Thread(target=run, name=what, daemon=True)
     thread.start()
     thread.join(LIMIT_S)
-    return found[0] if found else Finding(what, "problem", f"no answer within {LIMIT_S:g} s")
+    return found[0] if found else Diagnosis(what, "problem", f"no answer within {LIMIT_S:g} s")
 
 
-def check_python(packages: tuple[str, ...] = PACKAGES) -> Finding:
-    """Python and the packages that a run is made of."""
+def check_python(packages: tuple[str, ...] = PACKAGES) -> Diagnosis:
+    """Checks Python and the packages that a run needs."""
     versions, missing = [f"Python {platform.python_version()}"], []
     for package in packages:
         try:
@@ -111,21 +111,21 @@ def check_python(packages: tuple[str, ...] = PACKAGES) -> Finding:
             missing.append(package)
     if missing or sys.version_info < OLDEST:
         lacks = f"; not installed: {', '.join(missing)}" if missing else ""
-        return Finding("Python", "problem", ", ".join(versions) + lacks, ("make setup, with Python 3.11 or newer",))
-    return Finding("Python", "ok", ", ".join(versions))
+        return Diagnosis("Python", "problem", ", ".join(versions) + lacks, ("make setup, with Python 3.11 or newer",))
+    return Diagnosis("Python", "ok", ", ".join(versions))
 
 
-def check_processors() -> Finding:
-    """Processors and what else they do."""
+def check_processors() -> Diagnosis:
+    """Checks the number of processors and their present load."""
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     said = f"{cores} to run on, load {load:.2f}, Linux {platform.release()}"
     if load > cores:
-        return Finding("processors", "note", said, ("busy: runs on a wall clock will be late",))
-    return Finding("processors", "ok", said)
+        return Diagnosis("processors", "note", said, ("busy: runs on a wall clock will be late",))
+    return Diagnosis("processors", "ok", said)
 
 
-def check_waking(measured: Measured) -> Finding:
-    """How late a process is woken that slept for a millisecond."""
+def check_waking(measured: Measured) -> Diagnosis:
+    """Measures how late a process wakes up after a sleep of a millisecond."""
     late = []
     for _ in range(SLEEPS):
         begun_s = time.perf_counter()
@@ -134,12 +134,12 @@ def check_waking(measured: Measured) -> Finding:
     measured.jitter_s = float(np.percentile(late, 99))
     said = f"{np.median(late) * 1e6:.0f} µs late after 1 ms of sleep, at most 1 % later than {measured.jitter_s * 1e3:.2g} ms"
     if measured.jitter_s > LATE_S:
-        return Finding("waking", "note", said, ("keep to virtual time, or to periods of 10 ms and more",))
-    return Finding("waking", "ok", said)
+        return Diagnosis("waking", "note", said, ("keep to virtual time, or to periods of 10 ms and more",))
+    return Diagnosis("waking", "ok", said)
 
 
-def check_zenoh(measured: Measured, rounds: int = 200) -> Finding:
-    """Two sessions over the loopback, and how long a message takes from one to the other and back."""
+def check_zenoh(measured: Measured, rounds: int = 200) -> Diagnosis:
+    """Connects two sessions over the loopback and measures the round trip of a message."""
     back = threading.Event()
     (endpoint,) = loopback_endpoints(1)
     with (
@@ -152,51 +152,51 @@ def check_zenoh(measured: Measured, rounds: int = 200) -> Finding:
         ping = one.publisher("doctor/ping")
         other.declare_token("doctor/here")
         if one.watch_tokens("doctor/*").wait(["doctor/here"], LIMIT_S / 2):
-            return Finding("Zenoh", "problem", f"no connection over {endpoint}", ("is lo up? is there a firewall?",))
+            return Diagnosis("Zenoh", "problem", f"no connection over {endpoint}", ("is lo up? is there a firewall?",))
         times = []
         for _ in range(rounds):
             back.clear()
             begun_s = time.perf_counter()
             ping.put(b"doctor" * 10)
             if not back.wait(LIMIT_S / 4):
-                return Finding("Zenoh", "problem", f"messages are lost over {endpoint}")
+                return Diagnosis("Zenoh", "problem", f"messages are lost over {endpoint}")
             times.append(time.perf_counter() - begun_s)
     measured.round_trip_s = float(np.median(times))
-    return Finding("Zenoh", "ok", f"sessions over {endpoint}, {measured.round_trip_s * 1e6:.0f} µs there and back")
+    return Diagnosis("Zenoh", "ok", f"sessions over {endpoint}, {measured.round_trip_s * 1e6:.0f} µs there and back")
 
 
-def check_buffers(core: Path = Path("/proc/sys/net/core")) -> Finding:
-    """How large a burst a socket may hold for who is waiting for a processor."""
+def check_buffers(core: Path = Path("/proc/sys/net/core")) -> Diagnosis:
+    """Checks the largest socket buffer, which holds a burst while a process waits for a processor."""
     try:
         most, usual = (int((core / name).read_text()) for name in ("rmem_max", "rmem_default"))
     except (OSError, ValueError) as error:
-        return Finding("socket buffers", "note", f"not known: {error}")
+        return Diagnosis("socket buffers", "note", f"not known: {error}")
     said = f"receive at most {most >> 10} KiB, candump has {usual >> 10} KiB unless it asks (-r)"
     if most < BUFFER:
         advice = (
             f"against lost frames in bursts: sudo sysctl -w net.core.rmem_max={BUFFER} net.core.rmem_default={BUFFER}"
         )
-        return Finding("socket buffers", "note", said, (advice,))
-    return Finding("socket buffers", "ok", said)
+        return Diagnosis("socket buffers", "note", said, (advice,))
+    return Diagnosis("socket buffers", "ok", said)
 
 
-def check_disk(folder: Path) -> Finding:
-    """Room for recordings."""
+def check_disk(folder: Path) -> Diagnosis:
+    """Checks the free space for recordings."""
     free = shutil.disk_usage(folder).free
     said = f"{free / 1e9:.3g} GB free in {folder.resolve()}"
     if free < SPACE:
-        return Finding("disk", "note", said, ("record elsewhere with --out, or make room",))
-    return Finding("disk", "ok", said)
+        return Diagnosis("disk", "note", said, ("record elsewhere with --out, or make room",))
+    return Diagnosis("disk", "ok", said)
 
 
-def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Finding:
-    """Whether the plan's shortest period can be kept here in real time, by the work of a few instants in this process."""
+def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Diagnosis:
+    """Estimates from a few instants in this process whether this machine keeps the plan's shortest period in real time."""
     from echelon.sim.engines.in_process import Engine
 
     period_s = min(robot.period_ns for robot in plan.robots) / 1e9
     engine = Engine(plan)
     steps = engine.instants()
-    next(steps)  # what is made once
+    next(steps)  # the first instant contains work that is done only once
     begun_s, before = time.perf_counter(), sum(counts.sent for counts in engine.link_counts())
     done = sum(1 for _ in islice(steps, instants))
     spent_s = time.perf_counter() - begun_s
@@ -211,4 +211,4 @@ def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Find
         advice.append(
             f"woken up to {measured.jitter_s * 1e3:.2g} ms late: periods over {2e3 * measured.jitter_s:.2g} ms"
         )
-    return Finding("wall clock", "note" if advice else "ok", said, tuple(advice))
+    return Diagnosis("wall clock", "note" if advice else "ok", said, tuple(advice))

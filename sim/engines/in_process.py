@@ -1,7 +1,7 @@
-"""The in-process engine: all roles of a plan in one process, messages handed over directly.  The truth of the others.
+"""The engine in one process: it runs all roles of a plan and hands messages over directly (docs/architecture.md, 3.4).
 
-Stages of one instant run in the order of their turns (`echelon.runtime.turns`).  What the roles hear goes through the same
-mailboxes, and so through the same links, as between processes.
+It is the reference for the other ways to run a plan.  Stages of one instant run in the order of their turns
+(`echelon.runtime.turns`).  Messages pass the same mailboxes and links as between processes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +30,7 @@ def make_roles(plan: Plan) -> list[Role]:
 
 
 def make_role(plan: Plan, index: int) -> Role:
-    """Returns one role of a plan: a robot, a node, or the bridge or the drives between robots and their wheels.
+    """Returns one role of a plan: a robot, a node, the bridge or the drives.
 
     Raises IndexError if the plan has no role of that index."""
     one = plan.all_roles[index]
@@ -38,14 +38,14 @@ def make_role(plan: Plan, index: int) -> Role:
         return make_robot(plan, index)
     if isinstance(one, NodePlan):
         return TreeNode(plan, index)
-    from echelon.bridge.roles.commander import Commander  # the protocols of drives, for two processes alone
+    from echelon.bridge.roles.commander import Commander  # slow imports, which only bridge and drives need
     from echelon.bridge.roles.drive_bank import DriveBank
 
     return Commander(plan) if one.role == "bridge" else DriveBank(plan)
 
 
 class Row(NamedTuple):
-    """Stages that have their turn together, of all roles: (role, number of the stage, what it does, what it hears)."""
+    """The stages of all roles with the same turn: (role, number of the stage, its function, its inputs)."""
 
     turn: Turn
     period_ns: int
@@ -53,7 +53,7 @@ class Row(NamedTuple):
     stages: list[tuple[int, int, Callable[[int, Sequence[Heard]], tuple[Message, ...]], Mailbox]]
 
     def is_due(self, time_ns: int) -> bool:
-        """True if these stages run at an instant."""
+        """Returns whether these stages run at an instant."""
         return time_ns % self.period_ns == 0 and time_ns >= self.first_ns
 
 
@@ -69,7 +69,7 @@ def _timetable(plan: Plan, roles: Sequence[Role], mailboxes: Sequence[Mailbox]) 
 
 
 class Engine:
-    """A run in one process."""
+    """A run in one process.  `sink`, if given, gets every message."""
 
     def __init__(self, plan: Plan, sink: Sink | None = None) -> None:
         self.plan = plan
@@ -83,24 +83,23 @@ class Engine:
         self._receivers = receivers
         self.timetable = _timetable(plan, self.roles, self.mailboxes)
         self.tick_ns = gcd(*[row.period_ns for row in self.timetable])
-        """Between two instants"""
+        """Time between two instants [ns]"""
         self.first_ns = min(row.first_ns for row in self.timetable)
-        """The first instant: before 0 where drives are brought up"""
+        """The first instant [ns]: negative if drives are brought up"""
 
     @property
     def commander(self) -> "Commander | None":
-        """The role of the bridge, where the torque path is closed."""
+        """The role of the bridge; None on the mirrored path."""
         return None if self.plan.bridge is None else cast("Commander", self.roles[self.plan.bridge.index])
 
     @property
     def drives(self) -> "DriveBank | None":
-        """The role of the virtual drives, where there are any."""
+        """The role of the virtual drives; None if there are none."""
         return None if self.plan.drives is None else cast("DriveBank", self.roles[self.plan.drives.index])
 
     def instants(self) -> Iterator[int]:
-        """Runs the whole plan, from 0 (or from when drives are brought up) to its duration inclusive; yields each instant
-        [ns] when it is done."""
-        receivers, sink = self._receivers, self._sink  # `post`, written out: this is the innermost loop of all runs
+        """Runs the whole plan, from `first_ns` to its duration inclusive; yields each instant [ns] when it is done."""
+        receivers, sink = self._receivers, self._sink  # the body of `post` stands below: this is the innermost loop
         for time_ns in range(self.first_ns, self.plan.duration_ns + 1, self.tick_ns):
             for _, period_ns, first_ns, stages in self.timetable:
                 if time_ns % period_ns or time_ns < first_ns:
@@ -115,7 +114,7 @@ class Engine:
             yield time_ns
 
     def post(self, message: Message) -> None:
-        """Hands a message to all who hear it."""
+        """Hands a message to all its receivers."""
         self.messages += 1
         for receiver in self._receivers.get((message.source, message.channel), ()):
             receiver.deliver(message)

@@ -1,1 +1,1 @@
-"""Parts of a run that others wrote: found, tried, kept."""
+"""Users' own parts of a run: loading, trying, and limiting their time."""

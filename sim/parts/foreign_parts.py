@@ -1,7 +1,7 @@
-"""Parts that others wrote, in a run: who runs which, and who hangs in one.
+"""Users' own parts in a run: which role runs which, and which one hangs.
 
-A part that raises or answers nonsense says so itself (PartRunError).  One that never answers has to be found from outside:
-between processes by the supervisor's look at who says nothing, in one process by a limit to the time that an instant takes.
+A part that raises or returns nonsense causes PartRunError.  A part that never returns must be found from outside: the
+supervisor finds a silent process; in one process the time of an instant is limited.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from echelon.sim.parts.time_limit import TookTooLong, time_limit
 
 
 def parts_of(plan: Plan, index: int) -> tuple[str, ...]:
-    """Returns the parts that others wrote and a role runs, as the scenario names them."""
+    """Returns the users' parts that a role runs, as the scenario names them."""
     one = plan.all_roles[index]
     parts = []
     if isinstance(one, RobotPlan):
@@ -25,14 +25,15 @@ def parts_of(plan: Plan, index: int) -> tuple[str, ...]:
 
 
 def runs_text(plan: Plan, index: int) -> str:
-    """Returns the words on the parts that others wrote and a role runs, to follow its name; none if there are none."""
+    """Returns words about the users' parts that a role runs, to follow its name; "" if there are none."""
     parts = parts_of(plan, index)
     return f", which runs {' and '.join(parts)}" if parts else ""
 
 
 def unstalled(plan: Plan, instants: Iterator[int], seconds: float) -> Iterator[int]:
-    """Yields the instants of a run in one process.  Raises TookTooLong where one takes longer than that, if the plan has parts
-    that others wrote."""
+    """Yields the instants of a run in one process.
+
+    If the plan has users' parts, raises TookTooLong when an instant takes longer than `seconds`."""
     if not any(parts_of(plan, one.index) for one in plan.formation):
         yield from instants
         return
@@ -45,7 +46,7 @@ def unstalled(plan: Plan, instants: Iterator[int], seconds: float) -> Iterator[i
 
 
 def stalled_in(plan: Plan, error: TookTooLong) -> str:
-    """Returns who was at work when an instant took too long."""
+    """Returns in words which part was running when an instant took too long."""
     for frame, _ in walk_tb(error.__traceback__):
         role = frame.f_locals.get("self")
         if isinstance(role, (Robot, TreeNode)):

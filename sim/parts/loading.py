@@ -1,4 +1,4 @@
-"""The parts that are built into this package, and scenarios loaded with them."""
+"""The built-in parts, and the loading of scenarios with them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,19 +21,21 @@ from echelon.sim.parts.probe import probe
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
 
 LOAD_PATIENCE_S: Final = 20.0
-"""For a file that is read, or an installed part that is imported"""
+"""Time limit for reading a part's file or importing an installed part [s]"""
 
 
 class PatientRegistry(Registry):
-    """A registry in which finding and making a part may take `LOAD_PATIENCE_S` and no longer."""
+    """A registry that limits the time for finding and making a part to `LOAD_PATIENCE_S`."""
 
     def find(self, group: str, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
-        """Returns the class that `use` names, and its file if it comes from one in `folder`.  Raises PartError."""
+        """Returns the class that `use` names, and its source if it is a file in `folder`.
+
+        Raises PartError if it cannot be found or takes too long."""
         with _patience(use):
             return super().find(group, use, folder)
 
     def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
-        """Returns a part of a group with its parameters checked.  Raises PartError."""
+        """Returns a part of a group with checked parameters.  Raises PartError if it cannot be made or takes too long."""
         with _patience(use):
             return super().make(group, use, parameters, folder)
 
@@ -55,13 +57,14 @@ REGISTRY: Final = PatientRegistry(
         "protocols": PartGroup("protocols", DriveProtocol, PROTOCOLS, DEFAULT),
     }
 )
-"""All groups of parts, with what is built in."""
+"""All groups of parts, with the built-in parts of each."""
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, trial: bool = True) -> tuple[Scenario, Plan]:
-    """Reads a scenario file, applies overrides `key=value`, makes its plan, and tries the parts in it that others wrote.
+    """Reads a scenario file, applies overrides `key=value`, makes its plan, and tries the users' parts in it.
 
-    Without a `trial`, what a run left can be read whatever its parts do.  Raises ScenarioError."""
+    Without `trial` the parts are not tried, so that the result of a run can be read even if its parts fail.
+    Raises ScenarioError for any mistake."""
     loaded = echelon.planning.loading.load(path, overrides, REGISTRY)
     return _tried(str(path), *loaded) if trial else loaded
 
@@ -69,13 +72,13 @@ def load(path: Path, overrides: Sequence[str] = (), *, trial: bool = True) -> tu
 def parse(
     text: str, name: str, overrides: Sequence[str] = (), folder: Path = Path(), *, trial: bool = True
 ) -> tuple[Scenario, Plan]:
-    """Does the same with TOML text; `name` stands for the file in messages, `folder` holds files that the text names."""
+    """Does the same as `load` with TOML text; `name` names it in messages, and its file names are relative to `folder`."""
     loaded = echelon.planning.loading.parse(text, name, overrides, REGISTRY, folder)
     return _tried(name, *loaded) if trial else loaded
 
 
 def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:
-    """Returns what was loaded, after a trial of what others wrote."""
+    """Returns scenario and plan after a trial of the users' parts."""
     try:
         probe(plan)
         try_protocols(plan)

@@ -1,7 +1,7 @@
-"""Tries the parts of a plan that others wrote before a run begins: what fails at once is a mistake in the scenario.
+"""A trial of the users' parts of a plan before a run, so that a failure is reported as a mistake in the scenario.
 
-Each is asked as a run will ask it: a trajectory at instants of the run, a law for each block with the errors at the start and
-with none, a plant for each robot at rest and moving.  What they answer is checked as in a run.
+Each part is called as in a run: a trajectory at instants of the run; a law for each block, with the errors at the start and
+with zero errors; a plant for each robot, at rest and moving.  The results are checked as in a run.
 """
 
 import time
@@ -21,18 +21,18 @@ from echelon.plugins import Part
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
 
 PATIENCE_S: Final = 2.0
-"""For one question"""
+"""Time limit of one call [s]"""
 INSTANTS: Final = 100
-"""At which a trajectory is asked, spread over the run, as many as there are in `INSTANTS_S` [s]"""
+"""How many instants, spread over the run, a trajectory is tried at, as far as they take no longer than `INSTANTS_S` [s]"""
 INSTANTS_S: Final = 0.5
 _T = TypeVar("_T")
 
 
 def probe(plan: Plan) -> None:
-    """Tries the parts of a plan that are not built in.
+    """Tries the users' parts of a plan.
 
-    Raises PartRunError, whose text names file and class, if one raises, gives no answer of the right shape, or takes longer
-    than `PATIENCE_S`."""
+    Raises PartRunError, which names file and class, if a part raises, returns a wrong shape, or takes longer than
+    `PATIENCE_S`."""
     if not plan.trajectory.is_own:
         _probe_trajectory(plan)
     if not plan.law.is_own:

@@ -1,7 +1,7 @@
-"""A limit to the time that code of others may take, for it may never end.
+"""A time limit for users' code, which may never return.
 
-The kernel's timer interrupts the code by a signal, whatever it does in Python.  Python hears of signals in its main thread
-alone: in other threads there is no limit.
+A timer of the kernel interrupts the code by a signal.  Python handles signals in the main thread only, so there is no limit in
+other threads.
 """
 
 import signal
@@ -12,31 +12,31 @@ from contextlib import contextmanager
 from typing import Final
 
 REPEAT_S: Final = 1.0
-"""Code that swallows the interruption is interrupted again after so long."""
+"""Code that catches the interruption is interrupted again after this time."""
 
 
 class TookTooLong(BaseException):
-    """Raised within the code that took too long.  No Exception, so that `except Exception` does not swallow it."""
+    """Raised within code that took too long.  It is a BaseException, so that `except Exception` does not catch it."""
 
 
 class Limit:
-    """A limit in force."""
+    """An active limit."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self.in_force = True
 
     def renew(self) -> None:
-        """Lets the time begin anew."""
+        """Restarts the time."""
         if threading.current_thread() is threading.main_thread():
             signal.setitimer(signal.ITIMER_REAL, self._seconds, REPEAT_S)
 
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[Limit]:
-    """Raises TookTooLong in the block if it takes longer than that.
+    """A context that raises TookTooLong in its block if this takes longer than `seconds`.
 
-    Limits may be nested: the inner one is in force, and the time of the outer one goes on."""
+    Limits may be nested: the inner one applies, and the time of the outer one keeps running."""
     limit = Limit(seconds)
     if threading.current_thread() is not threading.main_thread():
         yield limit

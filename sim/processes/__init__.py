@@ -1,1 +1,1 @@
-"""A run as processes: brought up, watched over, taken down."""
+"""A run as processes: starting them, watching them, ending them."""

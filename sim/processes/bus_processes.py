@@ -1,4 +1,4 @@
-"""The processes at the CAN buses of a run: bridge, virtual drives, referee.
+"""The processes on the CAN buses of a run: bridge, virtual drives, referee.
 
 torque path   clock      bridge                drives               referee
 mirror        any        run_mirror_bridge     none                 run_wall_referee on a SocketCAN bus
@@ -44,7 +44,7 @@ _T = TypeVar("_T")
 
 
 def body_of(spec: ProcessSpec) -> Body:
-    """Returns what the process of a bridge, of drives or of a referee does."""
+    """Returns the body of the process of a bridge, of drives or of a referee."""
     if spec.kind == "referee":
         return run_wall_referee
     if not spec.plan.can.closed:
@@ -55,7 +55,7 @@ def body_of(spec: ProcessSpec) -> Body:
 
 
 def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The bridge that mirrors torques: robots' states to frames, on the bus, in can.log, and to the recorder."""
+    """Runs the bridge on the mirrored path: robots' states in; frames on the bus, into can.log, and to the recorder."""
     robots = [robot.index for robot in spec.plan.robots]
     reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots, spec.plan)
     publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
@@ -86,7 +86,7 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection) 
 
 
 def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """Bridge or drives on a closed torque path in virtual time, each at its place in the lockstep."""
+    """Runs bridge or drives on the closed path in virtual time, as a role in lockstep."""
 
     def make() -> ClosedBridge | LockstepDrives:
         if spec.kind == "bridge":
@@ -104,7 +104,7 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
         runner.stop()
 
     signal.signal(signal.SIGTERM, leave)
-    lock = threading.Lock()  # two threads say something over one pipe
+    lock = threading.Lock()  # two threads send over one pipe
 
     def say(what: Said) -> None:
         with lock:
@@ -118,7 +118,7 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
     failure: Failed | PartFailed | None = None
     try:
         runner.lockstep(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
-    except SystemExit:  # the run breaks off; what was counted so far is still reported
+    except SystemExit:  # the run breaks off, but the counts so far are still reported
         pass
     except BusError as error:
         failure = Failed(str(error))
@@ -142,7 +142,7 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
 
 
 def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], done: threading.Event) -> None:
-    """Tells how things stand, until the run is done."""
+    """Reports the progress of a station until the run is done."""
     while not done.wait(PROGRESS_S):
         try:
             say(station.progress())
@@ -151,7 +151,7 @@ def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], d
 
 
 def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The bridge of a closed torque path on a wall clock."""
+    """Runs the bridge on the closed path on a wall clock."""
     plan = spec.plan
     assert plan.bridge is not None
     bridge_key = data_key(spec.run, plan.bridge.path, Channel.WHEELS)
@@ -170,7 +170,7 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
             if now_ns - said_ns >= PROGRESS_NS:
                 said_ns = now_ns
                 control.send(bridge.progress())
-    finally:  # however it ends
+    finally:
         try:
             bridge.stop()
         finally:
@@ -179,10 +179,10 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) ->
 
 
 def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The virtual drives on a wall clock."""
+    """Runs the virtual drives on a wall clock."""
     buses = _open_buses(spec.can_urls)
     drives = WallDrives(spec.plan, buses)
-    mail = Mail(spec.plan, wakes=False)  # how shafts turn is early enough with the next frame
+    mail = Mail(spec.plan, wakes=False)  # wheel speeds are read with the next frame, which is early enough
     session.subscribe(_torque_keys(spec.run, spec.plan), mail.receive)
     clock = RunClock(meet(spec, session, control))
     until_ns: int | None = None
@@ -191,7 +191,7 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
         for message in mail.take():
             drives.bank.turn(clock.now(), message)
         if until_ns is None and hear_finish(control) is not None:
-            # Until the drives stopped by themselves if nobody stopped them.
+            # if the bridge did not stop the drives, wait until their watchdogs have
             until_ns = clock.now() + (2 * spec.plan.can.watchdog_ns if drives.bank.turning else 0)
     for bus in buses:
         bus.close()
@@ -199,9 +199,9 @@ def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) ->
 
 
 def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The referee on a wall clock: it hears the buses, and nobody else."""
+    """Runs the referee on a wall clock: it listens to the buses only."""
     buses = _open_buses(spec.can_urls)
-    # Processes wait for their turn; only what a drive's watchdog would notice, too, is late.
+    # processes wait for a processor, so a frame is late only by a time that a drive's watchdog would almost notice
     referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
     clock = RunClock(meet(spec, session, control))
     while hear_finish(control) is None:
@@ -221,7 +221,7 @@ def _torque_keys(run: str, plan: Plan) -> list[str]:
 
 
 def _made(make: Callable[[], _T]) -> _T:
-    """Returns what is made; a bus or a file that cannot be had is why the process cannot start."""
+    """Calls `make` and returns its result.  Raises StartError if a bus or a file cannot be opened."""
     try:
         return make()
     except (ValueError, OSError) as error:

@@ -1,5 +1,4 @@
-"""The processes of a run as their supervisor sees them: who they are and whom they talk to, how they start, what they
-say, how they ended."""
+"""The processes of a run, from the supervisor's side: their list and connections, their start, their messages and their end."""
 
 import os
 import signal
@@ -25,25 +24,25 @@ from echelon.sim.processes.to_supervisor import Done
 
 PRELOAD: Final = ["echelon.sim.processes.process"]
 ENVIRONMENT: Final = {"PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""For the processes of a run.  A formation's matrices are small: threads of numpy's would only wait for each other"""
+"""Environment variables of the processes.  The matrices of a formation are small, so threads of numpy would only cost time."""
 LAST_WORDS: Final = 4000
-"""Bytes kept of what a process says on standard error."""
+"""How many bytes of a process's standard error are kept."""
 ROLES: Final = ("robot", "leader", "coordinator")
-"""Kinds of processes that run parts which others may write"""
+"""Kinds of processes that may run parts written by users"""
 FINISHING: Final = ("bridge", "drives", "referee", "recorder")
-"""Processes that are told when to finish, in the order in which they are; bridge and drives keep step with the run by
-themselves where the torque path is closed and time is virtual."""
+"""Kinds of processes that get the order to finish, in this order.  Bridge and drives in lockstep do not need it: they are
+members and end with the run."""
 
 
 @dataclass(slots=True)
 class Child:
-    """A started process, with the ends of its pipes and what it has said so far."""
+    """A started process, with the supervisor's ends of its pipes and what has come over them."""
 
     spec: ProcessSpec
     process: ForkServerProcess
     control: Connection
     words: Connection
-    """Its standard output and standard error"""
+    """The pipe with its standard output and standard error"""
     heard_s: float
     ready: bool = False
     done: Done | None = None
@@ -53,16 +52,16 @@ class Child:
 
     @property
     def name(self) -> str:
-        """Its name in the run."""
+        """The name of the process in the run."""
         return self.spec.name
 
     @property
     def is_member(self) -> bool:
-        """True for those who are done when the run is; False for those who are told when to finish."""
+        """True: it ends by itself when the run is over.  False: it waits for the order to finish."""
         return self.spec.member
 
     def hear_words(self) -> None:
-        """Takes all that it has said on standard error and not been heard yet."""
+        """Reads what has come from its standard error."""
         try:
             while data := os.read(self.words.fileno(), 65536):
                 self.said.append(data)
@@ -71,22 +70,22 @@ class Child:
         self.words.close()
 
     def last_words(self) -> str:
-        """Returns the end of what it said on standard error."""
+        """Returns the end of its standard error."""
         return b"".join(self.said)[-LAST_WORDS:].decode(errors="replace").strip()
 
     def ending(self) -> str:
-        """Says how it ended."""
+        """Returns in words how the process ended."""
         code = self.process.exitcode
         if code is None:
             return "does not answer"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
     def runs(self) -> str:
-        """Says which parts that others wrote it runs; nothing if there are none."""
+        """Returns in words which users' parts the process runs; "" if none."""
         return runs_text(self.spec.plan, self.spec.index) if self.spec.kind in ROLES else ""
 
     def state(self) -> str:
-        """Returns what the kernel says of it: running, sleeping, stopped…"""
+        """Returns the kernel's state of the process: running, sleeping, stopped, …"""
         try:
             text = Path(f"/proc/{self.process.pid}/status").read_text()
         except OSError:
@@ -96,14 +95,14 @@ class Child:
 
 
 def warm_up() -> None:
-    """Starts the fork server, which imports in the background what processes need.  Call it early."""
+    """Starts the fork server, which imports the processes' modules in the background.  Call it early."""
     context = get_context("forkserver")
     context.set_forkserver_preload(PRELOAD)
     from multiprocessing import forkserver, resource_tracker
 
     with _on_its_own():
-        resource_tracker.ensure_running()  # which changes the mask when it starts
-    # Ctrl-C reaches the whole terminal: it is for this process alone, and not for one that is just importing.
+        resource_tracker.ensure_running()  # before the mask is set, since its start changes the mask
+    # Ctrl-C reaches all processes of the terminal, but only this one must react, not one that is importing
     unmasked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         with _on_its_own():
@@ -114,8 +113,10 @@ def warm_up() -> None:
 
 @contextmanager
 def _on_its_own() -> Iterator[None]:
-    """Starts processes that see no module of the working folder (a user's `numpy.py` there is not numpy), and that do not
-    run the calling script again: it needs no `if __name__ == "__main__":`, and may come from standard input."""
+    """A context in which processes start without the working folder and without the calling script.
+
+    So a user's file `numpy.py` in the working folder is not taken for numpy.  The calling script needs no
+    `if __name__ == "__main__":` and may come from standard input."""
     script, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ENVIRONMENT}
     sys.modules["__main__"] = ModuleType("__main__")
     os.environ |= ENVIRONMENT
@@ -157,10 +158,13 @@ def list_specs(
     recorded: bool,
     keep_going: bool,
 ) -> list[ProcessSpec]:
-    """Lists the processes of a run and who connects to whom.
+    """Returns the specifications of all processes of a run, with their connections.
 
-    Every node listens and its children connect; so does the recorder, to whom everyone connects.  To bridge and drives
-    robots connect, and the bridge to the drives.
+    process        who connects to it
+    node           its children
+    recorder       all members and the bridge
+    bridge         robots
+    drives         robots and the bridge
     """
     stations = [role.name for role in plan.bus_roles]
     if can_urls and not plan.can.closed:
@@ -235,11 +239,11 @@ def list_specs(
             )
         )
     if not virtual and any(url.startswith("socketcan") for url in can_urls):
-        # Elsewhere it would cost too much to hear every frame once more: there can.log is judged afterwards.
+        # on other buses it would cost too much to receive each frame once more: there can.log is judged afterwards
         specs.append(
             ProcessSpec(
                 kind="referee", name="referee", index=-1, listen=(), connect=(), peers=(), member=False, **common
             )
         )
-    # Those that import most start first.
+    # the processes with the most imports start first
     return sorted(specs, key=lambda spec: spec.kind not in FINISHING)

@@ -1,4 +1,12 @@
-"""What supervisor and processes of a run agree on: what a process is told at its start, how it joins, how it ends."""
+"""The contract between supervisor and processes: the specification of a process, how it joins a run, how it ends.
+
+step     what happens
+start    the supervisor starts the process with its `ProcessSpec`
+ready    the process has declared its subscribers, has seen the tokens of its peers, and says `Ready`
+run      the supervisor says `Start` when all are ready; members run to the end, others until `Finish`
+done     the process says `Done` with its counts and waits
+end      the supervisor says `End` when all are done; the process closes its session
+"""
 
 import os
 import resource
@@ -22,11 +30,11 @@ READY_TIMEOUT_S: Final = 20.0
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """Everything a process of a run needs to know."""
+    """Everything that a process of a run needs to know."""
 
     run: str
     kind: str
-    """`robot`, `leader`, `coordinator`, `recorder`, `bridge` or `drives`"""
+    """`robot`, `leader`, `coordinator`, `recorder`, `bridge`, `drives` or `referee`"""
     name: str
     index: int
     plan: Plan
@@ -37,31 +45,31 @@ class ProcessSpec:
     """(kind, name) of the processes whose tokens it waits for"""
     watched: bool = True
     member: bool = True
-    """It is done when the run is; otherwise it is told when to finish"""
+    """True: it ends by itself when the run is over.  False: it waits for the order to finish"""
     folder: str = ""
     can_urls: tuple[str, ...] = ()
-    """One per bus of the plan; none: no bus"""
+    """A URL for each bus of the plan; empty: no bus"""
     scenario_toml: str = ""
     metadata: dict[str, str] = field(default_factory=dict)
     keep_going: bool = False
     """The run goes on though a robot's state is not finite"""
     part_files: dict[str, str] = field(default_factory=dict)
-    """Texts of the files that parts come from, by their names in the folder"""
+    """Texts of the files of users' parts, by their names in the run's folder"""
 
 
 Body = Callable[[ProcessSpec, Session, Connection], None]
-"""What a process does once it has its session."""
+"""The function that a process runs once it has its session."""
 
 
 class StartError(Exception):
-    """What this process needs cannot be had; the text is for the user."""
+    """This process cannot start; the text says why, for the user."""
 
 
 def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
-    """Shows that this process is ready, waits for its peers and for the start; returns the start instant [ns].
+    """Shows the token of this process, waits for its peers and for `Start`; returns the start instant [ns].
 
-    To be called when all subscribers are declared: the token stands for them.  Raises StartError naming who is
-    missing, and who speaks another schema version.
+    Must be called after all subscribers are declared, since the token says so to others.  Raises StartError that names the
+    missing peers, and those with another schema version.
     """
     tokens = session.watch_tokens(f"echelon/{spec.run}/@alive/**")
     session.declare_token(token_key(spec.run, spec.kind, spec.name, f"{os.getpid()}-{time.monotonic_ns()}"))
@@ -90,8 +98,9 @@ def finish(
     links: Sequence[LinkCounts] = (),
     report: Report | None = None,
 ) -> None:
-    """Says what this process counted, and waits until everyone is done: a link that closes early would look like a death to
-    its neighbours."""
+    """Sends the counts of this process and waits for `End`.
+
+    A process that closed its session earlier would look dead to its neighbours."""
     cpu_s, resident = resources()
     control.send(Done(spec.name, cpu_s, resident, runner, tuple(links), report))
     control.recv()

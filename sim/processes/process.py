@@ -1,7 +1,6 @@
-"""What runs in each process of a distributed run: a member, the recorder, or the bridge.
+"""The entry point of each process of a distributed run (`contract` has the steps of its life).
 
-A process is told everything in its `ProcessSpec`; it says `ready` when it is connected to all it will talk to, starts
-when it is told to, and says `done` with what it counted.  Its words on standard error go to the supervisor.
+Standard output and standard error go to the supervisor.
 """
 
 import ctypes
@@ -28,10 +27,10 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
 def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
-    """Entry point of every process of a run."""
+    """Runs a process of a run; never returns normally."""
     _die_with(control)
-    _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # what ps, top and pgrep call it (15 characters)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal; the supervisor decides
+    _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # the name in ps, top and pgrep (15 characters)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but only the supervisor reacts
     signal.signal(signal.SIGTERM, _leave)
     os.dup2(words.fileno(), 1)
     os.dup2(words.fileno(), 2)
@@ -39,7 +38,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     body: Body
     try:
         if not spec.virtual and spec.kind == "recorder":
-            os.nice(10)  # it has time, others have not
+            os.nice(10)  # this process can wait, others cannot
         if spec.kind == "recorder":
             from echelon.sim.processes.watchers import run_recorder as body
         elif spec.kind in ("bridge", "drives", "referee"):
@@ -61,7 +60,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     except BaseException:
         traceback.print_exc()
         sys.stderr.flush()
-        os._exit(1)  # no atexit of the parent's, no wait for threads that may hang
+        os._exit(1)  # skips the parent's atexit functions and does not wait for threads that may hang
 
 
 def _open(spec: ProcessSpec) -> Session:
@@ -88,7 +87,7 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
     start_ns = meet(spec, session, control)
     signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())
     gc.collect()
-    gc.disable()  # nothing in the loop makes cycles, and a pause of one role is a pause of all
+    gc.disable()  # the loop makes no reference cycles, and a pause of one role delays all others
     try:
         if spec.virtual:
             runner.lockstep(lambda time_ns, sources: control.send(Waiting(time_ns, tuple(sources))))
@@ -97,23 +96,25 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
     except SystemExit:  # the run breaks off; what was counted so far is still told
         pass
     finally:
-        runner.finish()  # what a run that breaks off has said so far is to be recorded
+        runner.finish()  # also if the run breaks off: its messages so far must be recorded
     signal.signal(signal.SIGTERM, _leave)
     finish(spec, control, runner.counts, runner.mailbox.counts())
 
 
 def _leave(number: int, frame: object) -> None:
-    """Ends this process in good order: what it sent is delivered."""
+    """Ends this process after its messages are delivered."""
     raise SystemExit(0)
 
 
 def _die_with(supervisor: Connection) -> None:
-    """Ends this process when the supervisor ends, however that ends, and whatever this process is doing then."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # the fork server is the parent; it may outlive the supervisor
+    """Makes this process end whenever the supervisor ends, even if that is killed."""
+    _libc.prctl(
+        _PR_SET_PDEATHSIG, signal.SIGKILL
+    )  # covers the parent, the fork server, which may outlive the supervisor
     if os.getppid() == 1:
         os._exit(1)
     poller = select.poll()
-    poller.register(supervisor.fileno(), 0)  # no events but the hang-up
+    poller.register(supervisor.fileno(), 0)  # 0: only a hang-up is reported
 
     def wait() -> None:
         poller.poll()

@@ -1,8 +1,16 @@
-"""Brings the processes of a run up, watches over them, and takes them down again.
+"""The supervisor: it starts the processes of a run, watches them, and ends them (docs/architecture.md, 3.7).
 
-All processes come from one fork server that has imported what they need, so fifteen start in the time of one.  Nothing
-outlives the supervisor: every process sees its pipe to it hang up, and ends, even when the supervisor was killed.
-They talk over the loopback, at an address and ports of this run's own.
+phase          entered when                        what the supervisor does, and what ends the phase
+starting       `run` is called                     starts all processes; ends when all are ready
+running        `Start` is sent to all              watches for lost processes and stalls; ends when all members are done
+breaking off   a failure in one of the above, or   terminates the members, kills those that do not end within `GRACE_S`
+               Ctrl-C
+finishing      members are done or ended           sends `Finish` to bridge, drives, referee and recorder, one after the other
+taking down    all of them are done                sends `End`; kills what is left
+
+All processes come from one fork server that has imported their modules, so fifteen start in the time of one.  No process
+outlives the supervisor: each notices the hang-up of its pipe and ends, even if the supervisor was killed.  The processes talk
+over the loopback, at an address and ports of this run alone.
 """
 
 import signal
@@ -32,21 +40,21 @@ from echelon.sim.processes.to_supervisor import (
 from echelon.sim.results.trace import Array, Trace, TraceBuilder
 
 NAMED: Final = 12
-"""Processes that a note names; what is more is counted."""
+"""The largest number of processes that a note names; the others are counted."""
 START_TIMEOUT_S: Final = 30.0
 STALL_REPORT_S: Final = 3.0
-"""A run in virtual time that stands still for so long is reported, with the process everyone waits for."""
+"""A run in virtual time without progress for this time is reported, with the process that everyone waits for."""
 GRACE_S: Final = 3.0
-"""How long watchers may take to close their files when a run breaks off, and processes to end."""
+"""How long processes may take to end, and watchers to close their files, when a run breaks off."""
 FINISH_TIMEOUT_S: Final = 60.0
-"""How long watchers may take when a run is done."""
+"""How long watchers may take to finish after a complete run."""
 WALL_START_S: Final = 0.1
-"""From the barrier to run time 0 on a wall clock."""
+"""The time from `Start` to run time 0 on a wall clock, at least."""
 
 
 @dataclass(slots=True)
 class Progress:
-    """How a run stands, for a live table; `states` are the robots' last ones, at `states_ns`."""
+    """The present state of a run, for a live table; `states` are the last states of the robots, at `states_ns`."""
 
     phase: str = "starting"
     time_ns: int = 0
@@ -57,17 +65,17 @@ class Progress:
     bridge: BridgeProgress = field(default_factory=BridgeProgress)
     drives: BridgeProgress = field(default_factory=BridgeProgress)
     note: str = ""
-    """Something to tell at once, e.g. whom everyone waits for"""
+    """News for the user, for example which process everyone waits for"""
 
     def hear(self, recorder: RecorderProgress) -> None:
-        """Takes over how far the recorder is."""
+        """Takes over the progress of the recorder."""
         self.time_ns, self.messages = recorder.time_ns, recorder.messages
         self.states, self.states_ns = recorder.states, recorder.states_ns
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What a run left: the trace of what was recorded, counts, and `failure` if it did not finish."""
+    """The result of a run: the recorded trace, counts, and `failure` if the run did not finish."""
 
     trace: Trace
     links: list[LinkCounts]
@@ -90,7 +98,10 @@ class DivergedError(Exception):
 
 
 class Supervisor:
-    """One distributed run.  `show` is called about five times a second with the progress."""
+    """One distributed run.
+
+    `show` is called with the progress about five times a second.  A run in virtual time without progress for
+    `stall_timeout_s` is given up.  `order` may change the order in which processes start."""
 
     def __init__(
         self,
@@ -163,11 +174,11 @@ class Supervisor:
         return self._outcome(failure, startup_s, wall_s)
 
     def _lead_in_s(self) -> float:
-        """Returns how long after the barrier run time 0 is on a wall clock: drives are brought up until then."""
+        """Returns the time from `Start` to run time 0 on a wall clock, in which drives are brought up [s]."""
         return max(WALL_START_S, self.plan.can.bring_up_ns / 1e9 if self.plan.can.closed else 0.0)
 
     def _until(self, done: Callable[[], bool], timeout_s: float | None, what: str) -> None:
-        """Serves the children until `done`.  Raises RunError if one is lost, the run stalls, or the time is up."""
+        """Serves the children until `done`.  Raises RunError if a process is lost, the run stalls, or the time is over."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         shown_s = 0.0
         while not done():
@@ -189,7 +200,7 @@ class Supervisor:
                 raise RunError(f"{what} after {timeout_s:g} s: {who}{words}")
 
     def _serve(self, timeout_s: float) -> None:
-        """Takes what children say on their control pipes and on standard error."""
+        """Reads the control pipes and the standard error of all children."""
         by_handle: dict[Any, Child] = {}
         for child in self._children:
             if not child.control.closed:
@@ -262,7 +273,7 @@ class Supervisor:
         return "".join(said)
 
     def _check_stall(self, now_s: float) -> None:
-        """Raises or tells if the run, in virtual time, stands still."""
+        """Reports a run in virtual time that makes no progress; raises RunError after `stall_timeout_s`."""
         if self.progress.phase != "running" or not self.virtual:
             return
         at = (self.progress.time_ns, max((child.waiting_ns for child in self._children), default=-1))
@@ -281,7 +292,7 @@ class Supervisor:
             )
 
     def _who_is_waited_for(self, now_s: float) -> str:
-        """Says which processes everyone waits for: those that themselves wait for nobody and say nothing."""
+        """Returns in words which processes everyone waits for: those that report nothing, not even that they wait."""
         silent = [child for child in self._children if not child.is_member and now_s - child.heard_s > 2]
         if not silent:
             silent = [
@@ -302,13 +313,13 @@ class Supervisor:
         return "all wait: " + few(waits, "; ")
 
     def _stop_members(self) -> None:
-        """Ends the members of a run that broke off: first asked, so that what they hold back is sent, then made to."""
+        """Ends the members of a run that broke off: terminates them, so that they can send their last batches, then kills."""
         members = [child for child in self._children if child.is_member]
         for child in members:
             if child.process.is_alive():
                 child.process.terminate()
         deadline_s = time.monotonic() + GRACE_S
-        # Bridge and drives tell what they counted before they go, and must be listened to.
+        # bridge and drives report their counts before they end, and their pipe must be read meanwhile
         while time.monotonic() < deadline_s and any(
             child.process.is_alive() and child.done is None for child in members
         ):
@@ -321,8 +332,9 @@ class Supervisor:
                 child.process.kill()
 
     def _finish_watchers(self, failure: str | None, broken: bool) -> str | None:
-        """Lets bridge, drives and recorder finish, in this order; returns the failure, if there is one by now.  A run that has
-        broken off owes them messages that do not come."""
+        """Lets bridge, drives, referee and recorder finish, in this order; returns the failure, old or new.
+
+        A run that has `broken` off owes them messages that never come."""
         links = [counts for child in self._children if child.done for counts in child.done.links]
         sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
         for child in self._children:
@@ -338,9 +350,8 @@ class Supervisor:
                     or not child.process.is_alive()
                 ):
                     continue
-                whole = (
-                    not broken and failure is None and self.virtual
-                )  # on a wall clock, messages may be lost on the way
+                # On a wall clock, messages may be lost on the way.
+                whole = not broken and failure is None and self.virtual
                 order = Finish(
                     links=tuple(links),
                     robot_messages=sent["robot"] if whole else None,
@@ -368,7 +379,7 @@ class Supervisor:
         return failure
 
     def _take_down(self) -> None:
-        """Ends all processes: those that are done by word, the others by signal."""
+        """Ends all processes: sends `End` to those that are done, kills the others."""
         for child in self._children:
             if child.done is not None and not child.control.closed:
                 try:
@@ -421,11 +432,11 @@ class Supervisor:
             try:
                 child.control.send(message)
             except OSError:
-                pass  # lost; `_check_lost` will say so
+                pass  # the process is lost; `_check_lost` reports it
 
 
 def few(names: Sequence[str], between: str = ", ") -> str:
-    """Returns a list of names as text, with a dozen of them at most."""
+    """Returns names as text, `NAMED` of them at most; the others are counted."""
     more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
     return between.join([*names[:NAMED], *more])
 

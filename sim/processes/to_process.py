@@ -1,4 +1,4 @@
-"""What the supervisor of a run says to its processes, over their control pipes."""
+"""The supervisor's orders to the processes of a run, over their control pipes."""
 
 from dataclasses import dataclass
 
@@ -7,27 +7,27 @@ from echelon.runtime.link import LinkCounts
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Begin; run time 0 is at this instant of the monotonic clock (wall clock)."""
+    """Begin.  On a wall clock, run time 0 is at this instant of the monotonic clock."""
 
     start_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """For those who watch a run: it is over.  What they still have to expect, None where messages may be lost."""
+    """To watchers: the run is over.  The numbers of messages are None if messages may be lost."""
 
     links: tuple[LinkCounts, ...]
-    """Of all members, to be recorded"""
+    """Counts of all links, to be recorded"""
     robot_messages: int | None
-    """All that the robots said"""
+    """Number of messages that the robots sent"""
     messages: int | None
-    """All that the members and the bridge said"""
+    """Number of messages that all members and the bridge sent"""
 
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """All are done: close."""
+    """All processes are done: close."""
 
 
 Told = Start | Finish | End
-"""All that a process may be told."""
+"""Any order to a process."""

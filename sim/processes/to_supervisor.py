@@ -1,4 +1,4 @@
-"""What a process of a run says to its supervisor, over its control pipe."""
+"""The messages of a process to the supervisor, over its control pipe."""
 
 from dataclasses import dataclass
 
@@ -11,26 +11,26 @@ from echelon.sim.results.trace import Array, Trace
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """It is connected to all it will talk to."""
+    """The process is connected to all its peers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """It cannot go on; the text is for the user."""
+    """The process cannot go on; the text says why, for the user."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class PartFailed:
-    """A part that others wrote failed in it; the text names file and class."""
+    """A user's part failed in the process; the text names file and class."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """In a lockstep, it has waited for a while for messages of these members (their indices) of this instant."""
+    """In lockstep: the process has waited for a while for messages of this instant from the members `sources` (indices)."""
 
     time_ns: int
     sources: tuple[int, ...]
@@ -50,7 +50,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class RecorderProgress:
-    """How far the recording is; `states` are the robots' last ones, at `states_ns`."""
+    """Progress of the recorder; `states` are the last states of the robots, at `states_ns`."""
 
     time_ns: int
     messages: int
@@ -63,12 +63,12 @@ class RecorderProgress:
 
 @dataclass(frozen=True, slots=True)
 class RecorderReport:
-    """What the recorder leaves behind."""
+    """The recorder's report."""
 
     trace: Trace
     messages: int
     refused: int
-    """Batches that were no messages, and messages of unknown sources or out of their source's order"""
+    """Number of invalid batches, and of messages from unknown sources or out of order"""
     failure: str | None
     lost: Lost | None = None
     """Where the recording ends; None if it goes on to the end"""
@@ -81,12 +81,12 @@ class RecorderReport:
 
 
 Report = CanReport | DrivesReport | RefereeReport | RecorderReport
-"""What bridge, drives, referee and recorder leave behind."""
+"""The reports of bridge, drives, referee and recorder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """It has done its part; what it counted."""
+    """The process is done, with its counts."""
 
     name: str
     cpu_s: float
@@ -97,4 +97,4 @@ class Done:
 
 
 Said = Ready | Failed | PartFailed | Waiting | BridgeProgress | RecorderProgress | Done
-"""All that a process may say."""
+"""Any message of a process."""

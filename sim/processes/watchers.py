@@ -1,7 +1,7 @@
-"""Those who watch a run, and the first of them, the recorder.
+"""Watchers, the processes that receive all messages of a run, and the recorder as the most important one.
 
-They receive members' messages in batches and put them into one order of time first.  In virtual time a watcher that is
-slow slows the run; on a wall clock it loses, and says so.
+Messages come in batches and are first put into one order of time.  In virtual time, a slow watcher slows the run.  On a wall
+clock it loses messages and counts them.
 """
 
 import time
@@ -14,7 +14,7 @@ from typing import Final
 
 from echelon.bridge.frame_message import unpack
 from echelon.messages import Channel, Message
-from echelon.plan.layout import said_by
+from echelon.plan.layout import message_sizes
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Inbox, Session
@@ -27,27 +27,27 @@ from echelon.sim.results.trace import TraceBuilder
 
 PROGRESS_S: Final = 0.2
 SLACK_NS: Final = 60_000_000_000
-"""So long after its end a run on a wall clock may still say something."""
+"""On a wall clock, messages with times up to this long after the end of the run are accepted."""
 HIGH_WATER: Final = 256
-"""Batches a watcher may be behind before the run waits for it."""
+"""How many batches a watcher may be behind before the run waits for it."""
 DRAIN_S: Final = 10.0
-"""How long to wait for what a finished run still owes."""
+"""How long a watcher waits for the missing messages of a finished run."""
 SILENCE_S: Final = 0.3
-"""How long to wait for what a broken run may still have sent."""
+"""After this time without messages, a run that broke off counts as silent."""
 
 
 class Reception:
-    """Batches from the session, in one order of time."""
+    """Receives batches from the session and puts their messages into one order of time."""
 
     def __init__(self, inbox: Inbox, sources: Iterable[int], plan: Plan) -> None:
         self._inbox = inbox
         self._order = TimeOrder(sources)
-        self._sizes = said_by(plan)
+        self._sizes = message_sizes(plan)
         self._from_ns, self._until_ns = -plan.can.bring_up_ns, plan.duration_ns + SLACK_NS
         self.refused: dict[str, int] = {}
 
     def take(self, timeout_s: float) -> list[Message]:
-        """Waits for a batch; returns the messages that can go now."""
+        """Waits up to `timeout_s` for a batch; returns the messages whose place in the order is certain by now."""
         messages: list[Message] = []
         for batch in self._inbox.take(timeout_s):
             messages.extend(self._unpack(batch))
@@ -70,7 +70,7 @@ class Reception:
             count_refusal(self.refused, error.reason)
 
     def drain(self, expected: int | None) -> Iterator[list[Message]]:
-        """Yields what still comes at the end of a run: all that is `expected`, or (None) until it is silent."""
+        """Yields the last messages of a run: until `expected` messages have come in all, or (None) until it is silent."""
         deadline_s = time.monotonic() + DRAIN_S
         while (expected is None or self._order.pushed < expected) and time.monotonic() < deadline_s:
             before = self._order.pushed
@@ -81,12 +81,12 @@ class Reception:
 
     @property
     def refused_count(self) -> int:
-        """Batches that were no messages, and messages of unknown sources or out of their source's order."""
+        """Number of invalid batches, and of messages from unknown sources or out of order."""
         return sum(self.refused.values()) + self._order.refused
 
 
 def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """The recorder process: messages to run.mcap and into the trace; progress, then the trace, to the supervisor."""
+    """Runs the recorder: writes messages to run.mcap and into the trace; sends progress and the trace to the supervisor."""
     plan = spec.plan
     sources = speakers(plan, spec.virtual, bool(spec.can_urls))
     reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
@@ -114,10 +114,10 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
 
 
 class RunRecorder:
-    """Where a run's messages go once they are in order: run.mcap and the trace.
+    """Writes a run's ordered messages to run.mcap and into the trace.
 
     Both end with the instant at which a robot's state is first not finite, unless the run is to `keep_going`: from then on
-    everything soon is."""
+    everything soon is not."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class RunRecorder:
             if message.channel is Channel.STATE and not self._keep_going and self.lost is None and _is_lost(message):
                 self.lost = Lost(message.source, message.time_ns)
             if message.channel is Channel.FRAMES:
-                if message.source == self._bridge:  # which tells of the drives' frames, too
+                if message.source == self._bridge:  # its messages contain the drives' frames, too
                     for timed in unpack(message.values):
                         recorder.record_frame(timed)
             else:
@@ -156,7 +156,7 @@ class RunRecorder:
                 recorder.record(message)
 
     def progress(self) -> RecorderProgress:
-        """Returns how far the recording is."""
+        """Returns the progress of the recording."""
         states_ns, states = self._trace.last() or (0, None)
         return RecorderProgress(self._time_ns, self.messages, states_ns, states, self.recorder.failure, self.lost)
 
@@ -166,10 +166,10 @@ class RunRecorder:
         self.recorder.close()
 
     def report(self, refused: int = 0) -> RecorderReport:
-        """Returns the trace, and what became of the recording; `refused` messages did not come so far."""
+        """Returns the report with the trace; `refused` is the number of messages that were refused before."""
         return RecorderReport(self._trace.build(), self.messages, refused, self.recorder.failure, self.lost)
 
 
 def _is_lost(message: Message) -> bool:
-    """True if a value of a message is not finite."""
+    """Returns whether a value of a message is not finite."""
     return not all(map(isfinite, message.values.tolist()))

@@ -1,1 +1,1 @@
-"""A run as an MCAP file: written, read back, mended.  Where mcap is imported."""
+"""A run as an MCAP file: writing, reading, recovering.  Only this folder imports mcap."""

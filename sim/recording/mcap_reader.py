@@ -1,7 +1,7 @@
-"""Reading a recording, whole or cut short, and mending one that was cut.
+"""Reading recordings, complete or cut off, and recovering those that were cut off.
 
-A file is read record by record from its start, so that what a killed recorder left is worth as much as a finished file.
-Whatever is wrong with a file's content is a ValueError with one line that begins with its path.
+A file is read record by record from its start, so the file of a killed recorder can be read, too.  Any fault in the content
+of a file raises ValueError with one line that begins with its path.
 """
 
 import struct
@@ -45,13 +45,13 @@ _READERS: Final = {
 
 
 class CutError(ValueError):
-    """A recording that ends before its end."""
+    """The recording is cut off."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecoverResult:
-    """What was saved: messages, up to which run time [ns] (None if there are none), and how many damaged pieces were
-    left out; `complete` is True if nothing was missing."""
+    """The result of a recovery: number of messages, the run time of the last one [ns] (None if there are none), and the number
+    of damaged pieces that were left out; `complete` is true if nothing was missing."""
 
     messages: int
     until_ns: int | None
@@ -62,7 +62,7 @@ class RecoverResult:
 def read_trace(path: Path, plan: Plan) -> Trace:
     """Returns the robots' states, bit for bit as they were recorded.
 
-    Raises ValueError if the file is cut, damaged, no recording, or none of this plan."""
+    Raises ValueError if the file is cut off, damaged, not a recording, or not of this plan."""
     topics = [state_topic(robot.path) for robot in plan.robots]
     with _blame(path):
         times_ns, states = _by_robot(path, topics, "RobotState", ros.robot_state(), len(STATE_FIELDS))
@@ -70,10 +70,10 @@ def read_trace(path: Path, plan: Plan) -> Trace:
 
 
 def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Returns what the robots of a closed torque path wanted of their wheels: of each robot its instants [ns], (T,), and what
-    it said, (T, len(TORQUE_FIELDS)).
+    """Returns the wanted torques of the robots on a closed path: for each robot its instants [ns], (T,), and the values of its
+    messages, (T, len(TORQUE_FIELDS)).
 
-    Raises ValueError if the file is cut, damaged, no recording, or none of this plan."""
+    Raises ValueError if the file is cut off, damaged, not a recording, or not of this plan."""
     topics = [torque_topic(robot.path) for robot in plan.robots]
     with _blame(path):
         times_ns, torques = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), len(TORQUE_FIELDS))
@@ -83,7 +83,7 @@ def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArra
 def _by_robot(
     path: Path, topics: Sequence[str], kind: str, splice: ros.Splice, width: int
 ) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.float64], ...]]:
-    """Returns the times [ns] and the values, `width` numbers each, of the messages of topics, one topic for each robot."""
+    """Returns times [ns] and values (`width` numbers per message) of the messages on topics, one topic for each robot."""
     robots = {topic: robot for robot, topic in enumerate(topics)}
     prefix = len(splice.encode(ros.stamp(0), b""))
     times: list[list[int]] = [[] for _ in topics]
@@ -101,9 +101,9 @@ def _by_robot(
 
 
 def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
-    """Returns the counts of links with the run time [ns] they were taken at, in the order of the recording.
+    """Returns the counts of links, each with the run time [ns] at which it was taken, in the order of the recording.
 
-    Raises ValueError if the file is cut, damaged or no recording."""
+    Raises ValueError if the file is cut off, damaged or not a recording."""
     found = []
     with _blame(path):
         for _, time_ns, data in _messages(path, {LINKS}, "echelon_msgs/LinkStatistics"):
@@ -115,7 +115,7 @@ def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
 
 
 def read_scenario(path: Path) -> str:
-    """Returns the effective scenario, TOML.  A cut file will do.  Raises ValueError if there is none."""
+    """Returns the effective scenario as TOML, also from a file that is cut off.  Raises ValueError if there is none."""
     with _blame(path):
         for record in _records(path):
             if isinstance(record, Attachment) and record.name == SCENARIO:
@@ -124,7 +124,7 @@ def read_scenario(path: Path) -> str:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """Returns the metadata given to the recorder.  A cut file will do.  Raises ValueError if there is none."""
+    """Returns the recorder's metadata, also from a file that is cut off.  Raises ValueError if there are none."""
     with _blame(path):
         for record in _records(path):
             if isinstance(record, Metadata) and record.name == METADATA:
@@ -133,17 +133,17 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def is_finished(path: Path) -> bool:
-    """Returns True if a file ends as a finished one does: behind its messages there is a summary for those who seek in it."""
+    """Returns whether a file ends like a finished one: with the summary that lets readers seek in it."""
     with path.open("rb") as file:
         file.seek(-min(len(MAGIC), path.stat().st_size), SEEK_END)
         return file.read() == MAGIC
 
 
 def recover(source: Path, target: Path) -> RecoverResult:
-    """Writes what is whole in `source` to `target`, with attachments and metadata, as a complete file.
+    """Writes the undamaged content of `source` to `target` as a complete file, with attachments and metadata.
 
-    `target` appears only when it is done.  Raises ValueError if `source` is no MCAP file, or is `target`, and OSError if
-    `target` cannot be written."""
+    `target` appears only when it is complete.  Raises ValueError if `source` is not an MCAP file, or is `target`, and OSError
+    if `target` cannot be written."""
     partial = target.with_name(target.name + ".part")
     with _blame(source):
         if target.exists() and target.samefile(source):
@@ -184,7 +184,7 @@ def _copy(source: Path, writer: Writer) -> RecoverResult:
 
 
 def _messages(path: Path, topics: "dict[str, int] | set[str]", kind: str) -> Iterator[tuple[str, int, bytes]]:
-    """Yields topic, time and bytes of the messages of some topics, all of one type of ours."""
+    """Yields topic, time [ns] and bytes of the messages on `topics`, which must be of the type `kind` of echelon_msgs."""
     schemas, wanted = dict[int, Schema](), dict[int, str]()
     for record in _records(path):
         if isinstance(record, Message):
@@ -204,8 +204,8 @@ def _messages(path: Path, topics: "dict[str, int] | set[str]", kind: str) -> Ite
 def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:
     """Yields schemas, channels, messages, attachments and metadata in the order of the file.
 
-    What is damaged raises ValueError, or is left out and noted in `damaged`.  Raises CutError where the file ends
-    before its end."""
+    A damaged record raises ValueError; if `damaged` is given, it is skipped and noted there.  Raises CutError where the file
+    is cut off."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -232,7 +232,7 @@ def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecor
 
 
 def _unpacked(opcode: int, body: bytes) -> list[McapRecord]:
-    """Returns a record, or those in it if it is a chunk.  Raises ValueError if it is damaged."""
+    """Returns the record, or the records in it if it is a chunk.  Raises ValueError if it is damaged."""
     try:
         if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]) != struct.unpack("<I", body[-4:])[0] != 0:
             raise ValueError("checksum")
@@ -241,7 +241,7 @@ def _unpacked(opcode: int, body: bytes) -> list[McapRecord]:
             return [record]
         stream, length = get_chunk_data_stream(record, validate_crc=True)
         data = stream.read(length)
-    except Exception as error:  # whatever a parser makes of bytes that are not what they say they are
+    except Exception as error:  # the parsers raise all kinds of errors for damaged bytes
         raise ValueError(f"is damaged: a {Opcode(opcode).name.lower()} cannot be read") from error
     records, at = list[McapRecord](), 0
     while at < len(data):
@@ -269,7 +269,7 @@ def _message(body: bytes) -> Message:
 
 @contextmanager
 def _blame(path: Path) -> Iterator[None]:
-    """Puts a file's path before what is wrong with it, on one line."""
+    """A context in which errors about a file become ValueError with its path in front, on one line."""
     try:
         yield
     except CutError as error:

@@ -1,8 +1,8 @@
-"""An MCAP file as it is written: in the same bytes for the same messages, and safe from a kill.
+"""Writing an MCAP file: the same messages give the same bytes, and a killed recorder loses little (docs/architecture.md, 6.2).
 
-A chunk ends when it is full, whatever the clock on the wall says.  Yet what was recorded must outlive a killed recorder.
-So the chunk in progress is written provisionally, at short intervals of wall time, behind the last finished one, and is
-overwritten by its later self.  (A kill within that one write can cost the chunk: some microseconds ten times a second.)
+A chunk ends when it is full, never because of wall time, so that the bytes do not depend on the speed of the run.  The chunk in
+progress is written provisionally at short intervals of wall time, behind the last finished chunk; each later write overwrites
+it.  (A kill during such a write can cost the chunk.  A write takes some microseconds, ten times a second.)
 """
 
 import fcntl
@@ -38,33 +38,34 @@ from echelon.sim.recording import ros
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "echelon"
 METADATA: Final = "echelon"
-"""The name under which a run's metadata stands."""
+"""The name of a run's metadata record."""
 CHUNK_SIZE: Final = 256 * 1024
-"""Bytes of messages before compression: a second of a formation of nine at 100 Hz, a tenth at 1 kHz."""
+"""Size of a chunk before compression [bytes]: one second of nine robots at 100 Hz, a tenth of a second at 1 kHz."""
 FLUSH_NS: Final = 100_000_000
-"""Wall time between two provisional writes; with calls of `flush_if_due` as far apart, a kill costs 0.2 s at most."""
+"""Wall time between two provisional writes.  If `flush_if_due` is called as often, a kill costs at most 0.2 s."""
 LEVEL: Final = 1
-"""Of zstd: 0.40 of the size at 0.33 us a message; lz4 gives 0.46 at 0.20 us, zstd's level 3 gives 0.40 at 0.49 us."""
+"""Level of zstd: 0.40 of the size at 0.33 µs per message.  lz4 gives 0.46 at 0.20 µs, zstd's level 3 gives 0.40 at 0.49 µs."""
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _INDEX: Final = struct.Struct("<BQHI")
 
 
 class ChunkedFile:
-    """An MCAP file being written: definitions first, then chunks of messages, at the end a summary.
+    """An MCAP file being written: definitions, then chunks of messages, then a summary.
 
-    It never raises OSError: it stops, and `failure` says why; the file then ends with the last messages it could take,
-    as a killed recorder's would."""
+    After it is open it never raises OSError.  On an error it stops writing, and `failure` says why; the file then ends like
+    that of a killed recorder."""
 
     def __init__(
         self, path: Path, attachments: dict[str, bytes], metadata: dict[str, str], topics: dict[str, str]
     ) -> None:
-        """Opens the file (raises OSError if it cannot be made) and writes its beginning.
+        """Creates the file and writes its beginning.  Raises OSError if it cannot be created.
 
-        `topics` gives the type of each topic; channels are numbered from 1 in its order."""
+        `topics` maps topics to types; channels are numbered from 1 in this order."""
         self.failure: str | None = None
         self._path = path
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-        with suppress(OSError):  # tells others that it is being written, until this process ends, however it ends
+        # the lock tells other processes that the file is being written, until this process ends
+        with suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._position = 0
         self._tail = b""
@@ -97,7 +98,7 @@ class ChunkedFile:
         self._append(start + record + _records(*self._schemas, *self._channels))
 
     def add(self, channel: int, sequence: int, time_ns: int, data: bytes) -> None:
-        """Takes a message."""
+        """Adds a message."""
         buffer, entries = self._buffer, self._index[channel]
         entries.append(time_ns)
         entries.append(len(buffer))
@@ -107,7 +108,7 @@ class ChunkedFile:
             self._finish_chunk()
 
     def flush_if_due(self, monotonic_ns: int) -> None:
-        """Writes the chunk in progress if `FLUSH_NS` have passed since it was last done."""
+        """Writes the chunk in progress provisionally if `FLUSH_NS` have passed since the last time."""
         if self._flushed_ns is not None and monotonic_ns - self._flushed_ns < FLUSH_NS:
             return
         self._flushed_ns = monotonic_ns
@@ -118,7 +119,7 @@ class ChunkedFile:
                 self._tail = tail
 
     def close(self) -> None:
-        """Writes what is left, and the summary; the file is complete unless `failure` says otherwise."""
+        """Writes the last chunk and the summary.  The file is then complete, unless there is a `failure`."""
         if self._file < 0:
             return
         self._finish_chunk()
@@ -140,7 +141,7 @@ class ChunkedFile:
         )
 
     def _finish_chunk(self) -> None:
-        """Writes the chunk in progress for good, with the index of its messages, and begins the next."""
+        """Writes the chunk in progress for the last time, with the index of its messages, and begins the next."""
         if self.failure is None and self._buffer:
             chunk = self._chunk()
             data, offsets = _records(chunk), {}
@@ -176,7 +177,7 @@ class ChunkedFile:
             entries.clear()
 
     def _append(self, data: bytes) -> bool:
-        """Writes for good; True if it is done."""
+        """Writes data that will not be overwritten; returns whether it succeeded."""
         if self.failure is not None or not self._write(data):
             return False
         self._position += len(data)
@@ -184,7 +185,7 @@ class ChunkedFile:
         return True
 
     def _write(self, data: bytes) -> bool:
-        """Writes behind what is there for good, in place of what is there provisionally; True if it is done."""
+        """Writes behind the finished data, over the provisional chunk; returns whether it succeeded."""
         try:
             _write_at(self._file, data, self._position)
             if len(data) < len(self._tail):

@@ -1,6 +1,6 @@
-"""The recorder: a run as an MCAP file that any ROS viewer opens.
+"""The recorder: writes a run as an MCAP file that ROS viewers can open (docs/architecture.md, 6.2).
 
-Every time in the file is the run's own, so the same run gives the same bytes.
+All times in the file are run times, so the same run gives the same bytes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,11 @@ from echelon.sim.recording.scene import DESIRED, Scene, desired
 SCENARIO: Final = "scenario.toml"
 """The name of the attachment that holds the effective scenario."""
 FRAMES, LINKS = "/can/frames", "/links"
-"""Frames of the only bus; of several, the name of each stands between: `/can/can1/frames`."""
+"""Topics of frames and of counts of links.  With several buses, the topics of frames have their names: `/can/can1/frames`."""
 
 
 class Recorder:
-    """Writes a run's messages, and what shows them, as they come: in the order of time, then source."""
+    """Writes the messages of a run and the ROS messages that show them.  Messages must come in order of time, then source."""
 
     def __init__(
         self,
@@ -34,10 +34,11 @@ class Recorder:
         metadata: dict[str, str],
         part_files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Begins the file at `path`; raises OSError if it cannot be made.  The scenario goes into it as an attachment
-        and `metadata` (versions and the like) as metadata; the texts `part_files` as attachments, too, by their names."""
+        """Creates the file at `path`.  Raises OSError if it cannot be created.
+
+        The scenario and the texts `part_files` (by name) become attachments; `metadata`, such as versions, become metadata."""
         self.null_messages = 0
-        """How many messages said nothing; they are not written."""
+        """Number of null messages; they are not written."""
         self._plan = plan
         self._scene = Scene(plan)
         topics, routes = _routes(plan)
@@ -60,11 +61,11 @@ class Recorder:
 
     @property
     def failure(self) -> str | None:
-        """Why nothing is written any more, or None."""
+        """Why writing stopped; None if it did not."""
         return self._file.failure
 
     def record(self, message: Message) -> None:
-        """Takes a message.  Raises ValueError if it has not as many values as the plan says."""
+        """Takes a message.  Raises ValueError for a wrong number of values."""
         raw = message.values.tobytes()
         if not raw:
             self.null_messages += 1
@@ -83,7 +84,7 @@ class Recorder:
             self._scene.states[source] = message.values
 
     def record_frame(self, timed: TimedFrame) -> None:
-        """Takes a CAN frame; what came before run time 0, when drives were brought up, is in can.log alone."""
+        """Takes a CAN frame.  Frames from before run time 0 are not written; they are in can.log."""
         time_ns, bus, _, (can_id, data, remote) = timed
         if self._file.failure is None and time_ns >= 0 and bus < len(self._frames):
             frame = ros.can_frame(ros.stamp(time_ns), can_id, data, remote)
@@ -100,23 +101,23 @@ class Recorder:
             self._link_messages += 1
 
     def flush_if_due(self, monotonic_ns: int) -> None:
-        """To be called ten times a second or more: what was recorded until then outlives a kill."""
+        """Secures what was recorded so far against a kill; should be called at least ten times a second."""
         self._file.flush_if_due(monotonic_ns)
 
     def close(self) -> None:
-        """Writes what is left.  May be called twice."""
+        """Writes the rest of the file.  A second call does nothing."""
         self._show()
         self._file.close()
 
     def _advance(self, time_ns: int) -> None:
-        """Ends an instant: all its messages have come, so it can be shown."""
+        """Ends the present instant, since all its messages have come, and shows it if that is due."""
         if time_ns > self._now:
             self._show()
         self._now = time_ns
         self._head = ros.stamp(time_ns)
 
     def _show(self) -> None:
-        """Shows the instant that ends if its turn has come."""
+        """Writes the ROS messages that show the instant that ends, if that is due."""
         if self._now < self._next_display or self._file.failure is not None:
             return
         for topic, data in self._scene.messages(self._now):
@@ -127,7 +128,7 @@ class Recorder:
 
 
 def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
-    """Returns the types of the topics of messages, and by 16 source + channel the topic and encoder of each message."""
+    """Returns the types of all topics, and topic and encoder of each kind of message by 16 * source + channel."""
     topics: dict[str, str] = {}
     routes: dict[int, tuple[str, ros.Splice]] = {}
 
@@ -157,7 +158,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
 
 
 def frame_topics(plan: Plan) -> list[str]:
-    """Returns the topics of the frames, bus by bus."""
+    """Returns the topics of the frames, one for each bus."""
     if len(plan.can.buses) == 1:
         return [FRAMES]
     return [f"/can/{ros.ros_name(bus.name)}/frames" for bus in plan.can.buses]

@@ -1,8 +1,8 @@
 """ROS 2 messages as bytes: definitions (ros2msg) and encoders (CDR, little endian).
 
-A CDR message is four bytes of encapsulation, then its fields; a number lies at a multiple of its size, counted from
-behind the encapsulation.  What is written thousands of times a second never changes its size: its bytes are laid out
-once (`Layout`), and a message is those bytes with the stamp and the float64 values put in their places.
+A CDR message is four bytes of encapsulation, then its fields.  A number stands at a multiple of its size, counted from the end
+of the encapsulation.  Messages that are written thousands of times a second have a constant size.  So their bytes are laid out
+once (`Layout`); for each message, stamp and float64 values are put into their places.
 """
 
 import struct
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 WORLD: Final = "world"
-"""The frame of reference in which all positions are."""
+"""The frame of reference of all positions."""
 ARROW, SPHERE, LINE_STRIP = 0, 2, 4
 
 _HEADER: Final = "std_msgs/Header header\n"
@@ -71,21 +71,21 @@ DEFINITIONS: Final = {
     "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
     "float64 age_mean_ns\nint64 age_max_ns\n",
 }
-"""Message definitions by name, without the middle `msg`; a definition names the types of its fields in full."""
+"""Message definitions by name, without the middle part `msg`.  Types of fields are written with their package."""
 
 
 def ros_name(path: str) -> str:
-    """Returns a path of names as ROS allows it in topics and frames, where hyphens are not: `g-1/r2` is `g_1/r2`."""
+    """Returns a path of names as a valid ROS name, in which hyphens are not allowed: `g-1/r2` becomes `g_1/r2`."""
     return path.replace("-", "_")
 
 
 def schema_name(name: str) -> str:
-    """Returns a type's name with the middle `msg`: `nav_msgs/Odometry` is `nav_msgs/msg/Odometry`."""
+    """Returns a type's name with the middle part `msg`: `nav_msgs/Odometry` becomes `nav_msgs/msg/Odometry`."""
     return name.replace("/", "/msg/")
 
 
 def schema_text(name: str) -> str:
-    """Returns a definition followed by those of all types in it, as ros2msg wants it."""
+    """Returns a definition followed by those of all types in it: the format ros2msg."""
     parts, found, waiting = [DEFINITIONS[name]], {name}, [name]
     while waiting:
         for line in DEFINITIONS[waiting.pop(0)].splitlines():
@@ -98,12 +98,12 @@ def schema_text(name: str) -> str:
 
 
 def stamp(time_ns: int) -> bytes:
-    """Returns how a message with a header begins: encapsulation and stamp, 12 bytes."""
+    """Returns the beginning of a message with a header: encapsulation and stamp, 12 bytes."""
     return ENCAPSULATION + struct.pack("<iI", *divmod(time_ns, 1_000_000_000))
 
 
 class Layout:
-    """A message being laid out, field by field; it remembers where stamps and float64 values are to be put."""
+    """A message that is laid out field by field, with the places of stamps and float64 values."""
 
     def __init__(self) -> None:
         self.body = bytearray()
@@ -111,32 +111,32 @@ class Layout:
         self.places: list[int] = []
 
     def put(self, code: str, *values: float) -> "Layout":
-        """Puts numbers of one type, a code of `struct`."""
+        """Adds numbers of one type, given as a code of `struct`."""
         size = struct.calcsize(f"<{code}")
         self.body += bytes(-len(self.body) % size) + struct.pack(f"<{len(values)}{code}", *values)
         return self
 
     def string(self, text: str) -> "Layout":
-        """Puts a string: its length, its bytes, a zero."""
+        """Adds a string: its length, its bytes, a zero."""
         data = text.encode() + b"\x00"
         self.put("I", len(data))
         self.body += data
         return self
 
     def header(self, frame_id: str) -> "Layout":
-        """Puts a header; its stamp is filled in later."""
+        """Adds a header, whose stamp is filled in later."""
         self.put("I", 0)
         self.stamps.append(len(self.body) - 4)
         return self.put("I", 0).string(frame_id)
 
     def hole(self, count: int) -> "Layout":
-        """Leaves room for float64 values that are filled in later."""
+        """Adds places for `count` float64 values, which are filled in later."""
         self.put("d", *[0.0] * count)
         self.places.extend(range(len(self.body) - 8 * count, len(self.body), 8))
         return self
 
     def holes(self, count: int) -> "Layout":
-        """The same for a sequence; an empty one is only its length, without alignment of what it does not hold."""
+        """Adds a sequence with places for `count` float64 values.  An empty sequence has no alignment after its length."""
         self.put("I", count)
         return self.hole(count) if count else self
 
@@ -146,7 +146,9 @@ class Template:
 
     def __init__(self, layout: Layout) -> None:
         size = 8 + len(layout.body)
-        self._bytes = np.zeros(size + -size % 8, np.uint8)  # four idle bytes, the encapsulation, the body at offset 8
+        self._bytes = np.zeros(
+            size + -size % 8, np.uint8
+        )  # four unused bytes and the encapsulation align the body to 8
         self._bytes[4:size] = np.frombuffer(ENCAPSULATION + layout.body, np.uint8)
         self._words, self._doubles = self._bytes.view("<u4"), self._bytes.view("<f8")
         self._message = self._bytes[4:size]
@@ -155,23 +157,23 @@ class Template:
         self._places = np.array(layout.places, int) // 8 + 1
 
     def encode(self, time_ns: int, values: Array) -> bytes:
-        """Returns the message; `values` are as many as the layout has places, in its order."""
+        """Returns the message; `values` fill the places of the layout in its order."""
         self._words[self._seconds], self._words[self._nanoseconds] = divmod(time_ns, 1_000_000_000)
         self._doubles[self._places] = values
         return self._message.tobytes()
 
 
 class Splice:
-    """A laid-out message that begins with a header and whose values come as one run of bytes, the float64 in order.
+    """A laid-out message that begins with a header and gets its float64 values as bytes, in order.
 
-    Faster than `Template`: constant bytes and pieces of the run are joined."""
+    It is faster than `Template`, since it only joins constant bytes and pieces of these bytes."""
 
     def __init__(self, layout: Layout) -> None:
         starts = [at for at in layout.places if at - 8 not in layout.places]
         ends = [at + 8 for at in layout.places if at + 8 not in layout.places]
         body = bytes(layout.body)
         self.size = 8 * len(layout.places)
-        """How many bytes of values a message holds."""
+        """Number of bytes of values in a message."""
         self._first = body[8 : starts[0]]
         self._end = ends[0] - starts[0]
         self._rest: list[tuple[bytes, int, int]] = []
@@ -197,12 +199,12 @@ def robot_state() -> Splice:
 
 
 def group_state(error_rates: int, positions: int) -> Splice:
-    """Returns the encoder of echelon_msgs/GroupState; its values are `GROUP_FIELDS`, then as many as given of each."""
+    """Returns the encoder of echelon_msgs/GroupState; its values are `GROUP_FIELDS`, error rates, positions."""
     return Splice(Layout().header(WORLD).hole(len(GROUP_FIELDS)).holes(error_rates).holes(positions))
 
 
 def reference(accelerations: int, error_rates: int, forces: int) -> Splice:
-    """Returns the encoder of echelon_msgs/Reference; its values are as many of each, in this order."""
+    """Returns the encoder of echelon_msgs/Reference; its values are accelerations, error rates, forces."""
     return Splice(Layout().header(WORLD).holes(accelerations).holes(error_rates).holes(forces))
 
 
@@ -222,7 +224,7 @@ def wheels(torques: int) -> Splice:
 
 
 def transforms(frames: Sequence[str]) -> Template:
-    """Returns the encoder of tf2_msgs/TFMessage from the world to robots; values per robot: x, y, q_z, q_w."""
+    """Returns the encoder of tf2_msgs/TFMessage, from the world to `frames`; values of each frame: x, y, q_z, q_w."""
     layout = Layout().put("I", len(frames))
     for frame in frames:
         layout.header(WORLD).string(frame).hole(2).put("d", 0.0, 0.0, 0.0).hole(2)
@@ -230,8 +232,10 @@ def transforms(frames: Sequence[str]) -> Template:
 
 
 def odometry(frame: str) -> Template:
-    """Returns the encoder of nav_msgs/Odometry of a robot; values: x, y, q_z, q_w, then in its own frame forward speed,
-    lateral speed, yaw rate.  Covariances are zero, which stands for unknown."""
+    """Returns the encoder of nav_msgs/Odometry of a robot.
+
+    Values: x, y, q_z, q_w, then forward speed, lateral speed and yaw rate in the robot's frame.  Covariances are zero, which
+    means unknown."""
     layout = Layout().header(WORLD).string(frame).hole(2).put("d", 0.0, 0.0, 0.0).hole(2).put("d", *[0.0] * 36)
     return Template(layout.hole(2).put("d", 0.0, 0.0, 0.0).hole(1).put("d", *[0.0] * 36))
 
@@ -245,7 +249,7 @@ def joint_state(names: Sequence[str]) -> Template:
 
 
 def markers(count: int) -> Layout:
-    """Returns a visualization_msgs/MarkerArray to which `count` markers are to be added by `add_marker`."""
+    """Returns the layout of a visualization_msgs/MarkerArray; exactly `count` markers must follow by `add_marker`."""
     return Layout().put("I", count)
 
 
@@ -258,7 +262,7 @@ def add_marker(
     color: tuple[float, float, float, float],
     points: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Adds a marker in the world; its values are x, y, q_z, q_w, or none if it has points."""
+    """Adds a marker in the frame `WORLD`; its values are x, y, q_z, q_w, or none if it has points."""
     layout.header(WORLD).string(namespace).put("i", number, kind, 0)
     if points:
         layout.put("d", *[0.0] * 6, 1.0)
@@ -267,16 +271,16 @@ def add_marker(
     layout.put("d", *scale).put("f", *color).put("i", 0, 0).put("B", 0).put("I", len(points))
     if points:
         layout.put("d", *[number for x, y in points for number in (x, y, 0.0)])
-    layout.put("I", 0).string("")  # no colours of its own for each point, no texture
-    layout.put("I", 0, 0).string("").string("").put("I", 0).put("I", 0)  # the texture's image, its coordinates
-    layout.string("").string("").string("").put("I", 0).put("B", 0)  # text, mesh, the mesh's file
+    layout.put("I", 0).string("")  # colours of points, texture_resource
+    layout.put("I", 0, 0).string("").string("").put("I", 0).put("I", 0)  # texture, uv_coordinates
+    layout.string("").string("").string("").put("I", 0).put("B", 0)  # text, mesh_resource, mesh_file
 
 
-_FRAME: Final = struct.Struct("<I4xIBBBB8s")  # an empty frame_id, up to the next multiple of four; then the CAN frame
+_FRAME: Final = struct.Struct("<I4xIBBBB8s")  # an empty frame_id, padded to a multiple of four; then the CAN frame
 
 
 def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> bytes:
-    """Returns a can_msgs/Frame, an extended one if the identifier needs it; `head` is from `stamp`.
+    """Returns a can_msgs/Frame; identifiers above 11 bits make it an extended one.  `head` is from `stamp`.
 
     Raises ValueError if `data` is longer than eight bytes."""
     if len(data) > 8:
@@ -285,7 +289,7 @@ def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> by
 
 
 def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:
-    """Returns an echelon_msgs/LinkStatistics; `name` is for people."""
+    """Returns an echelon_msgs/LinkStatistics; `name` is the link in words."""
     layout = Layout().header("").put("I", counts.source, counts.receiver).put("B", counts.channel).string(name)
     layout.put("Q", counts.sent, counts.delivered, counts.lost, counts.in_flight, counts.used, counts.held)
     layout.put("d", counts.age_mean_ns).put("q", counts.age_max_ns)

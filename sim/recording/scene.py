@@ -1,4 +1,4 @@
-"""What a viewer is shown of a run: frames of reference, odometry, wheels, and markers of robots and groups."""
+"""The scene of a run for viewers: frames of reference, odometry, wheels, and markers of robots and groups."""
 
 from math import isfinite
 from typing import Final
@@ -26,13 +26,13 @@ COLORS: Final = (
     (0.89, 0.47, 0.76, 1.0),
     (0.09, 0.75, 0.81, 1.0),
 )
-"""Of groups, in turn; the formation itself is grey."""
+"""Colours of the groups, used in turn; the formation itself is grey."""
 
 
 class Scene:
-    """The latest states of a plan's robots and the messages that show them.
+    """The last states of a plan's robots, and the ROS messages that show them.
 
-    `states` holds one row of `STATE_FIELDS` per robot; a robot that has said nothing yet stands where it starts."""
+    `states` has a row of `STATE_FIELDS` for each robot; before its first message a robot is at its start."""
 
     def __init__(self, plan: Plan) -> None:
         self.states: list[Values] = []
@@ -44,7 +44,7 @@ class Scene:
         self.topics |= {JOINT_STATES: "sensor_msgs/JointState"}
         names = [ros.ros_name(robot.path) for robot in plan.robots]
         self.topics |= {f"/{name}/odom": "nav_msgs/Odometry" for name in names}
-        """The type of each topic that `messages` fills."""
+        """The types of the topics of `messages`, by topic."""
         self._arm = np.array([robot.arm for robot in plan.robots])
         self._offset = np.array([robot.offset for robot in plan.robots])
         self._wheel_radius = np.array([robot.wheel_radius for robot in plan.robots])
@@ -57,14 +57,14 @@ class Scene:
         self._markers = _markers(plan)
 
     def messages(self, time_ns: int) -> list[tuple[str, bytes]]:
-        """Returns topic and bytes of each message that shows the states now; what is not finite is shown as it is."""
+        """Returns topic and bytes of each message that shows the present states; values that are not finite are kept."""
         states = np.array(self.states)
         x, y, vx, vy, theta, v, omega, _, _, tau_right, tau_left = states.T[:11]
         with np.errstate(all="ignore"):
             cos, sin = np.cos(theta), np.sin(theta)
             poses = np.stack([x, y, np.sin(theta / 2), np.cos(theta / 2)], axis=1)
             arrows = poses.copy()
-            arrows[:, 0] -= self._offset * cos  # an arrow stands on the axle, the position is the reference point's
+            arrows[:, 0] -= self._offset * cos  # an arrow begins at the axle, but the position is the reference point's
             arrows[:, 1] -= self._offset * sin
             spheres = np.zeros((len(self._means), 4))
             spheres[:, :2] = self._means @ poses[:, :2]
@@ -86,7 +86,7 @@ class Scene:
 
 
 def desired(plan: Plan) -> bytes:
-    """Returns the centroid's desired trajectory as a line, of time 0: it is shown whole and does not change."""
+    """Returns the whole desired trajectory of the centroid as a line, a message of time 0 that never changes."""
     places = Desired(plan).sample(np.linspace(0.0, plan.duration_ns / 1e9, DESIRED_POINTS))[:, 0]
     points = [(x, y) for x, y in places.tolist() if isfinite(x) and isfinite(y)]
     layout = ros.markers(1)
@@ -95,12 +95,12 @@ def desired(plan: Plan) -> bytes:
 
 
 def _size(plan: Plan) -> float:
-    """Returns a size to draw centroids in: that of a typical robot."""
+    """Returns the size of centroids in the scene [m]: that of a typical robot."""
     return float(np.median([2 * robot.arm for robot in plan.robots]))
 
 
 def _markers(plan: Plan) -> ros.Template:
-    """Lays out an arrow per robot and a sphere per node, each group in its colour."""
+    """Returns the encoder of the markers: an arrow for each robot and a sphere for each node, each group in its colour."""
     layout = ros.markers(len(plan.robots) + len(plan.nodes))
     by_index = {node.index: node for node in plan.nodes}
     for robot in plan.robots:

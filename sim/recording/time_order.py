@@ -1,4 +1,4 @@
-"""Puts the messages of many sources into one order of time, whatever the order in which their batches come."""
+"""Putting the messages of many sources into one order of time, whatever the order of arrival."""
 
 from collections.abc import Iterable
 from typing import Final
@@ -10,17 +10,18 @@ _BEFORE_ALL_NS: Final = -(1 << 62)
 
 
 def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
-    """Returns the numbers of those whose messages are recorded: robots and nodes, then the bridge, then the drives, which say
-    something of their own only in virtual time."""
+    """Returns the indices of the roles whose messages are recorded: robots and nodes, then the bridge, then the drives.
+
+    Drives send messages of their own only in virtual time."""
     if not plan.can.closed:
         return range(len(plan.formation) + has_bus)
     return range(len(plan.all_roles) if virtual else len(plan.formation) + 1)
 
 
 class TimeOrder:
-    """Messages by (time, source, channel), released once every source has gone past their time.
+    """Orders messages by (time, source, channel).  A message is released when every source has sent a later one.
 
-    Each source sends in order of time.  What is released is the same for the same messages, however they came.
+    Each source sends in order of time.  The order of the released messages does not depend on the order of arrival.
     """
 
     def __init__(self, sources: Iterable[int]) -> None:
@@ -28,12 +29,12 @@ class TimeOrder:
         self._waiting: dict[int, list[Message]] = {}
         self._released_ns = _BEFORE_ALL_NS
         self.pushed = 0
-        """Messages taken."""
+        """Number of accepted messages."""
         self.refused = 0
-        """Messages of unknown sources, or older than what was released."""
+        """Number of messages from unknown sources, or older than released ones."""
 
     def push(self, messages: list[Message]) -> list[Message]:
-        """Takes messages, in each source's order; returns those that can go now, in order."""
+        """Takes messages, in order for each source; returns the released ones in the common order."""
         waiting, latest = self._waiting, self._latest
         for message in messages:
             time_ns = message.time_ns
@@ -51,7 +52,7 @@ class TimeOrder:
         return self._release(min(latest.values()))
 
     def rest(self) -> list[Message]:
-        """Returns what is left, in order: for the end of a run, when no source goes past the last instant."""
+        """Returns the remaining messages in order.  The end of a run needs it, since no source sends anything later then."""
         return self._release(1 << 63)
 
     def _release(self, safe_ns: int) -> list[Message]:

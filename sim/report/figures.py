@@ -88,7 +88,8 @@ def transformed_state(blocks: Blocks, plan: Plan, width: float) -> Picture:
                         wanted = thin(blocks.times_ns, series.desired[:, number], log)
                         axes.plot(*wanted, color="#b9b9c2", lw=2.4, solid_capstyle="butt", zorder=1)
                         real = thin(blocks.times_ns, series.value[:, number], log)
-                        mark = {"marker": look.mark, "markevery": every, "ms": 3.2, "mew": 0} if every else {}
+                        marked = every if np.isfinite(real[1]).any() else None  # matplotlib marks no empty line
+                        mark = {"marker": look.mark, "markevery": marked, "ms": 3.2, "mew": 0} if marked else {}
                         axes.plot(*real, color=look.colour, lw=1.0, ls=style, zorder=3, **mark)
                 time.with_log(log).apply(axes, layer == layers[-1][0])
             row[0].set_title(title)

@@ -234,27 +234,29 @@ def _separation(one: _Shown) -> str:
 
 def _trajectories(one: _Shown) -> str:
     plan, distance = one.run.trace.plan, one.run.summary.distance
-    number_of_figure, how = ("3", "with") if plan.avoidance.enabled else ("2", "without")
+    in_paper, how = ("Fig. 3", "with") if plan.avoidance.enabled else ("Fig. 2", "without")
     what = f"Paths of the {len(plan.robots)} robots {how} avoidance"
+    where = f" (the paper's {in_paper})" if _is_paper(one) else ""
     return figure(
         FIGURES["trajectories"](one),
         f"{what}; smallest distance {number(distance.smallest, 'm')}.",
-        f"{what}{_in_paper(one, f' (the paper’s Fig. {number_of_figure})')}. Open triangles: start; filled: end, pointing in "
-        "heading direction; tinted: each group's final shape. Dashed grey: desired centroid; black: its real path.",
+        f"{what}{where}. Open triangles: start; filled: end, pointing in heading direction; tinted: each group's final shape. "
+        "Dashed grey: desired centroid; black: its real path.",
     )
 
 
-def _in_paper(one: _Shown, text: str) -> str:
-    """Returns a text if the run shows what the paper shows."""
-    return text if one.run.summary.scenario == PAPER else ""
+def _is_paper(one: _Shown) -> bool:
+    """Returns whether a run shows what the paper shows."""
+    return one.run.summary.scenario == PAPER
 
 
 def _transformed(one: _Shown) -> str:
+    where = "The paper's Fig. 4. " if _is_paper(one) else ""
     return figure(
         FIGURES["blocks"](one),
         "Every shape variable and the centroid over time, on a linear and a logarithmic axis, with what is desired.",
-        f"{_in_paper(one, 'The paper’s Fig. 4. ')}Time linear (left) and logarithmic (right). Solid: x; dashed: y; grey bands: "
-        "desired. Colours and marks: groups; purple: inter-group; black: centroid.",
+        f"{where}Time linear (left) and logarithmic (right). Solid: x; dashed: y; grey bands: desired. Colours and marks: "
+        "groups; purple: inter-group; black: centroid.",
     )
 
 

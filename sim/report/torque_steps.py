@@ -28,7 +28,7 @@ def steps_text(trace: Trace) -> str:
         if step > 0 and len(stepped) and stepped.mean(axis=0).max() > SHARE:
             found.setdefault(step, []).append(robot.name)
     return " ".join(
-        f"In frames of {some(names)} torque has steps of {step:.3g} N m: where it is small it goes up and down by a step or "
-        "two, and its line becomes a band."
+        f"The frames of {some(names)} carry torque in steps of {step:.3g} N m: where it is small it goes up and down by a step "
+        "or two, and its line becomes a band."
         for step, names in found.items()
     )

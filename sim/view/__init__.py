@@ -1,1 +1,1 @@
-"""What a person sees in a terminal while something goes on."""
+"""Live displays in a terminal."""

@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: a live table with a progress bar, or plain lines where there is no terminal."""
+"""The display of a run in progress: a live table with a progress bar, or plain lines if there is no terminal."""
 
 import sys
 import time
@@ -18,13 +18,13 @@ from echelon.sim.processes.supervisor import Progress
 from echelon.sim.results.desired import Desired
 
 PLAIN_S = 2.0
-"""Between two plain lines."""
+"""Time between two plain lines."""
 FAULTS = 3
-"""Faults of drives that are shown in words."""
+"""How many faults of drives are shown in words."""
 
 
 class Display:
-    """Shows progress on standard error; `show` may be called as often as one likes."""
+    """Shows progress on standard error.  `show` may be called at any rate."""
 
     def __init__(self, plan: Plan, stream: TextIO = sys.stderr, quiet: bool = False) -> None:
         self._plan = plan
@@ -41,7 +41,7 @@ class Display:
             self._live.start()
 
     def show(self, progress: Progress) -> None:
-        """Shows how the run stands."""
+        """Shows the present state of the run."""
         note = progress.note or progress.bridge.note or progress.drives.note
         if note and note != self._note:
             self.say(note)
@@ -62,13 +62,13 @@ class Display:
             print(text, file=self._stream, flush=True)
 
     def close(self) -> None:
-        """Takes the table away; may be called twice."""
+        """Removes the table.  A second call does nothing."""
         if self._live is not None:
             self._live.stop()
             self._live = None
 
     def errors(self, progress: Progress) -> dict[str, float]:
-        """Returns by block the norm of its error [m] in the robots' last states."""
+        """Returns the norm of each block's error [m] in the last states of the robots, by the block's name."""
         if progress.states is None:
             return {}
         z_cd = self._trajectory.at(progress.states_ns * 1e-9)

@@ -1,6 +1,6 @@
-"""What `echelon can` shows of buses: per wheel what is commanded and what is reported, bus by bus how full it is.
+"""The display of `echelon can`: commanded and reported torque of each wheel, and the load of each bus.
 
-As a table for a terminal, as a line of text, and as data for JSON.
+It exists as a table for a terminal, as a line of text, and as data for JSON.
 """
 
 from collections import deque
@@ -18,25 +18,25 @@ from echelon.bridge.timing.bus_load import frame_bits
 from echelon.plan.plan import Plan, RobotPlan
 
 HALF: Final = 8
-"""Cells of a bar on each side of zero"""
+"""Number of cells of a bar on each side of zero"""
 BARS_FROM: Final = 110
-"""Columns of a terminal"""
+"""Smallest width of a terminal in which bars are shown [columns]"""
 FINDINGS: Final = 5
-"""The last ones, told in full"""
+"""How many of the last findings are shown in full"""
 _SLOT_NS: Final = 100_000_000
 _SLOTS: Final = 10
 _EIGHTHS: Final = " ▏▎▍▌▋▊▉█"
 
 
 class Rate:
-    """How much came in the last second, in steps of 0.1 s."""
+    """The amount that came in the last second, in steps of 0.1 s."""
 
     def __init__(self) -> None:
         self._slots: deque[list[int]] = deque()
         self._begin_ns: int | None = None
 
     def add(self, time_ns: int, amount: int = 1) -> None:
-        """Takes an amount."""
+        """Adds an amount."""
         if self._begin_ns is None:
             self._begin_ns = time_ns
         slot = time_ns // _SLOT_NS
@@ -48,7 +48,7 @@ class Rate:
                 self._slots.popleft()
 
     def per_second(self, time_ns: int) -> float:
-        """Returns the amount per second; of the time since the first if that is less than a second ago."""
+        """Returns the amount per second, over the last second or the time since the first amount."""
         if self._begin_ns is None:
             return 0.0
         now = time_ns // _SLOT_NS
@@ -58,14 +58,14 @@ class Rate:
 
 
 class CanTable:
-    """Takes all frames of a plan's buses, and shows what they say.  `places` says where each bus is."""
+    """Takes all frames of a plan's buses and shows their content.  `places` names each bus: a URL or a file."""
 
     def __init__(self, plan: Plan, referee: Referee, places: tuple[str, ...]) -> None:
         self.plan = plan
         self.referee = referee
         self.places = places
         self.time_ns = 0
-        """Of the last frame"""
+        """Time of the last frame [ns]"""
         self._frames = [Rate() for _ in plan.can.buses]
         self._bits = [Rate() for _ in plan.can.buses]
         self._of_robot = [Rate() for _ in plan.robots]
@@ -85,7 +85,7 @@ class CanTable:
         self._last += self.referee.observe(time_ns, bus, frame)
 
     def data(self, time_ns: int) -> dict[str, Any]:
-        """Returns how everything stands, ready for JSON: SI units, None for what is not known."""
+        """Returns the present state as data for JSON: SI units, None for unknown values."""
         return {
             "time": time_ns / 1e9,
             "buses": [
@@ -124,7 +124,7 @@ class CanTable:
         }
 
     def line(self, time_ns: int) -> str:
-        """Returns how everything stands in one line."""
+        """Returns the present state in one line."""
         data = self.data(time_ns)
         parts = [f"t {data['time']:.1f} s"]
         for bus in data["buses"]:
@@ -142,7 +142,7 @@ class CanTable:
         return "  ".join(parts)
 
     def render(self, time_ns: int, width: int = 120) -> RenderableType:
-        """Returns how everything stands as a table, what is wrong in red; bars where there is room for them."""
+        """Returns the present state as a table, faults in red, with bars if `width` is large enough."""
         bars = width >= BARS_FROM
         table = Table(box=None, padding=(0, 1), header_style="dim")
         for name in ("robot", "wheel"):
@@ -199,12 +199,12 @@ def finding_text(finding: Finding) -> str:
 
 
 def torque_limit(robot: RobotPlan) -> float:
-    """Returns the largest torque [N m] a wheel of the robot can be asked for, what bars are drawn against."""
+    """Returns the largest torque that may be commanded to a wheel of the robot [N m]: the full length of a bar."""
     return min(robot.envelope.torque_limit, robot.torque_limit, robot.drive.motor.torque_limit)
 
 
 def bar(value: float | None, limit: float) -> Text:
-    """Returns a bar from zero in the middle towards the right for positive values; red beyond the limit."""
+    """Returns a bar that begins in the middle and goes to the right for positive values; it is red beyond the limit."""
     if value is None or not isfinite(value):
         return Text(" " * (2 * HALF + 1))
     share = 0.0 if not value else max(-1.0, min(1.0, value / limit if limit else value / abs(value)))
@@ -212,7 +212,7 @@ def bar(value: float | None, limit: float) -> Text:
     whole, rest = divmod(eighths, 8)
     beyond = abs(value) > limit * 1.000001
     style = "bold red" if beyond else "cyan" if value > 0 else "yellow"
-    if value < 0:  # no blocks grow from the right: half a cell is told by ▐
+    if value < 0:  # Unicode has no eighths of a block that grow from the right, only the half ▐
         left = ("▐" if rest >= 4 else "") + "█" * whole
         return Text.assemble((left.rjust(HALF), style), ("│", "dim"), " " * HALF)
     right = "█" * whole + (_EIGHTHS[rest] if rest else "")
@@ -220,7 +220,7 @@ def bar(value: float | None, limit: float) -> Text:
 
 
 def _age(wheel: WheelReading, time_ns: int) -> float | None:
-    """Returns how old [s] the last report is; the last command where nobody reports."""
+    """Returns the age of the last report [s], or of the last command if no drive reports."""
     at_ns = wheel.commanded_ns if wheel.reported_ns is None else wheel.reported_ns
     return None if at_ns is None else max(0, time_ns - at_ns) / 1e9
 

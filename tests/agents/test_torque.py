@@ -43,7 +43,7 @@ def test_wanted_acceleration_is_what_the_plant_does(lab):
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
-def test_robot_with_its_point_behind_the_axle_does_it_too(lab):
+def test_wanted_acceleration_with_the_point_behind_the_axle(lab):
     behind = replace(lab, offset=-lab.offset)
     inverse, step, h = make_inverse(behind), make_step(behind), 1e-5
     state = state_at(0.0, 0.0, 0.4, 0.5, -1.0)
@@ -98,7 +98,7 @@ def drives(torque=inf, rate=inf, speed=inf) -> TorqueLimits:
     return TorqueLimits(torque, rate, speed, wheel_radius=0.05, arm=0.15)
 
 
-def test_magnitude_is_limited_each_wheel_for_itself():
+def test_the_magnitude_is_limited_for_each_wheel():
     limits = drives(torque=1.5)
     assert limits.apply(1.5, -1.5, 0.0, 0.0, 0.01) == (1.5, -1.5, False)
     assert limits.apply(1.6, 0.3, 0.0, 0.0, 0.01) == (1.5, 0.3, True)
@@ -106,7 +106,7 @@ def test_magnitude_is_limited_each_wheel_for_itself():
     assert limits.apply(inf, -inf, 0.0, 0.0, 0.01) == (1.5, -1.5, True)
 
 
-def test_change_is_limited_from_what_was_given_not_wanted():
+def test_the_change_is_limited_from_the_last_limited_torque():
     limits = drives(rate=100.0)  # 1 N m in 10 ms
     assert limits.apply(2.5, 0.5, 0.0, 0.0, 0.01) == (1.0, 0.5, True)
     assert limits.apply(2.5, 0.5, 0.0, 0.0, 0.01) == (2.0, 0.5, True)
@@ -116,7 +116,7 @@ def test_change_is_limited_from_what_was_given_not_wanted():
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_wheel_that_is_too_fast_is_not_driven_on_but_is_braked(sign):
+def test_a_wheel_beyond_its_speed_limit_can_only_be_braked(sign):
     limits = drives(speed=40.0)  # 2 m/s at the rim
     assert limits.apply(sign, sign, sign * 1.99, 0.0, 0.01) == (sign, sign, False)
     assert limits.apply(sign, sign, sign * 2.01, 0.0, 0.01) == (0.0, 0.0, True)
@@ -127,7 +127,7 @@ def test_a_wheel_that_is_too_fast_is_not_driven_on_but_is_braked(sign):
     assert limits.apply(sign, sign, sign * 1.0, sign * 7.0, 0.01) == (0.0, sign, True)
 
 
-def test_what_is_no_number_becomes_zero():
+def test_nan_becomes_zero():
     limits = drives(torque=1.5)
     assert limits.apply(nan, 1.0, 0.0, 0.0, 0.01) == (0.0, 1.0, True)
     assert limits.apply(1.0, nan, nan, nan, 0.01) == (1.0, 0.0, True)
@@ -137,7 +137,7 @@ def test_what_is_no_number_becomes_zero():
     assert (right, left, limited) == (0.5, 0.5, False)
 
 
-def test_limits_hold_whatever_is_wanted():
+def test_limits_hold_for_any_wanted_torques():
     random, h = np.random.default_rng(5), 0.01
     limits = drives(torque=1.5, rate=100.0, speed=40.0)
     last = np.zeros(2)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shlex
 import shutil
 import subprocess
@@ -160,8 +161,9 @@ def test_no_room_for_the_first_file_is_one_line(tmp_path: Path) -> None:
     limited = f"ulimit -f 1; exec {shlex.join(command)} --out {shlex.quote(str(tmp_path))}"
     done = subprocess.run(["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 3
-    assert done.stderr.splitlines() == [f"echelon: {tmp_path}: File too large"]
+    assert done.stderr.splitlines() == [f"echelon: {tmp_path}/scenario.toml: File too large"]
     assert not done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == [".echelon.json"]
 
 
 def test_a_bus_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
@@ -252,7 +254,52 @@ def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
     assert echelon("report", folder, folder, "--out", page).returncode == 0
     assert page.stat().st_size > 10_000
     done = echelon("report", folder, folder, "--out", page, "--json")
-    assert json.loads(done.stdout) == {"report": str(page), "runs": [str(folder), str(folder)]}
+    assert json.loads(done.stdout) == {"report": str(page), "figures": [], "runs": [str(folder), str(folder)]}
+
+
+def test_figures_are_files_of_the_formats_that_are_asked_for(folder: Path, tmp_path: Path) -> None:
+    figures, before = tmp_path / "figures", (folder / "report.html").read_bytes()
+    done = echelon("report", folder, "--figures", figures, "--format", "svg", "--format", "pdf", "--format", "png")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        str(figures / f"{name}.{kind}")
+        for name in ("trajectories", "blocks", "errors", "distance", "torques")
+        for kind in ("svg", "pdf", "png")
+    ]
+    for kind, begins in (("svg", b"<svg "), ("pdf", b"%PDF-"), ("png", b"\x89PNG")):
+        assert all(path.read_bytes().startswith(begins) for path in figures.glob(f"*.{kind}"))
+    assert (folder / "report.html").read_bytes() == before
+    facts = json.loads(echelon("report", folder, folder, "--figures", figures, "--json").stdout)
+    assert facts["report"] is None
+    names = {Path(path).name for path in facts["figures"]}
+    assert {"compared-errors.svg", "short (1)-errors.svg", "short (2)-errors.svg"} <= names
+    assert len(names) == 4 + 5 + 5
+    says = "echelon: --format pdf: is of the files of --figures DIR\n"
+    assert echelon("report", folder, "--format", "pdf").stderr == says
+
+
+def test_a_report_overwrites_reports_alone_unless_it_is_told_to(folder: Path, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    page.write_text("<html>mine</html>")
+    done = echelon("report", folder, folder, cwd=tmp_path)
+    says = "echelon: report.html: is there, and no report of echelon's; give another file with --out\n"
+    assert (done.returncode, done.stderr) == (2, says)
+    assert page.read_text() == "<html>mine</html>"
+    for arguments in (("--out", "report.html"), ()):
+        assert echelon("report", folder, folder, *arguments, cwd=tmp_path).returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.parametrize("command", ["report", "export"])
+def test_a_full_disk_leaves_no_half_of_a_file(command: str, folder: Path, tmp_path: Path) -> None:
+    flag = {"report": "--out page.html", "export": "--csv ."}[command]
+    words = shlex.join([sys.executable, "-m", "echelon", command, str(folder)])
+    limited = ["bash", "-c", f"ulimit -f 20; exec {words} {flag}"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLCONFIGDIR": str(folder.parent)}
+    done = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, timeout=60, env=environment)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+    assert done.stderr.endswith("File too large\n")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_report_is_called_after_the_runs_folder_wherever_one_stands(folder: Path, tmp_path: Path) -> None:
@@ -267,17 +314,6 @@ def test_validate_explains_and_speaks_json() -> None:
     assert facts["robots"] == 9
     assert any("does not fit" in line for line in facts["can"])
     assert "can0 fits" in json.loads(echelon("validate", "lab", "--json").stdout)["can"][0]
-
-
-def test_analyse_puts_the_boundary_between_six_and_seven_milliseconds() -> None:
-    done = echelon("analyse", "paper", "--json")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
-    assert facts["largest_stable_delay"] == pytest.approx(0.006)
-    assert facts["spectral_radius"]["6"] < 1 < facts["spectral_radius"]["7"]
-    margins = [facts["blocks"][name]["delay_margin"] for name in ("g1", "inter", "centroid")]
-    assert margins == pytest.approx([0.0071117, 0.071117, 0.71117], rel=1e-4)
-    assert "7 ticks" in echelon("analyse", "paper").stdout
 
 
 def test_dbc_is_what_candump_and_cantools_need() -> None:

@@ -203,7 +203,7 @@ def test_the_schema_has_exactly_the_keys_that_are_known() -> None:
     assert '"null"' not in json.dumps(schema)
     assert ": null" not in json.dumps(schema)
     assert schema["$defs"]["RobotTable"]["properties"]["heading"]["description"].endswith(
-        "in radians [rad]; 0 unless given"
+        "x axis [rad]; 0 unless given"
     )
     assert "[°]" in schema["$defs"]["Shape"]["properties"]["rotation"]["description"]
 

@@ -1,7 +1,7 @@
-"""What every drive and host must do, whatever their protocol says on the wire.
+"""The rules for every drive and host, whatever the bytes of their protocol.
 
-To add a protocol: an entry in `PROTOCOLS`.  The tests see a robot's drives and host only through `bridge.protocols.frame` and
-`bridge.protocols.protocol`, and count what arrives, not what it looks like.
+A new protocol is added as an entry in `PROTOCOLS`.  The tests use only the interfaces in `bridge.protocols.frame` and
+`bridge.protocols.protocol`, and never look into the bytes of a frame.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,30 +23,30 @@ WHEELS = (0, 1)
 PERIOD_NS = 10 * MS
 WATCHDOG_NS = 100 * MS
 CYCLES = 60
-"""A few tens: by then a host must have its drives enabled."""
+"""Within this many cycles a host must enable its drives."""
 NOTICE: Final = 15
-"""Cycles in which a fault must have shown: some drives tell their state every 100 ms"""
+"""Within this many cycles a fault must show: some drives report their state every 100 ms only"""
 PROTOCOLS: dict[str, Callable[[Frame], bool]] = {
     "native": lambda frame: frame.data[4] & 32 != 0,
     "odrive": lambda frame: frame.can_id & 31 == 2,
     "cia402": lambda frame: frame.can_id & 0x780 == 0x200 and frame.data[:2] == b"\x02\x00",
     "my_drive.py:MyProtocol": lambda frame: frame.data[4] & 4 != 0,
 }
-"""By what a scenario says of them; and whether a frame of the host is an emergency stop"""
+"""Protocols by their name in a scenario, with a function that recognises an emergency stop in a frame of the host"""
 
 
 @dataclass
 class Rig:
-    """A robot's drives and host on a bus without delay, and what passed over it."""
+    """A robot's drives and host on a bus without delay, with all frames that it carried."""
 
     plan: DrivePlan
     time_ns: int = -200 * MS
     sent: list[tuple[int, Frame]] = field(default_factory=list)
-    """By drives"""
+    """Frames of the drives with their times [ns]"""
     commanded: list[tuple[int, Frame]] = field(default_factory=list)
-    """By the host"""
+    """Frames of the host with their times [ns]"""
     deaf: bool = False
-    """Nothing of the host reaches the drives"""
+    """True: no frame of the host reaches the drives"""
 
     def __post_init__(self) -> None:
         self.drives = make_drives(self.plan)
@@ -60,14 +60,14 @@ class Rig:
 
     @property
     def resolution(self) -> float:
-        """Half a bit of commanded plus half a bit of reported torque [N m], and rounding"""
+        """The largest difference between wanted and reported torque [N m]: half a bit of each, and rounding of floats"""
         return self.protocol.resolution(self.plan) + 1e-6
 
     def new_host(self) -> Host:
         return self.protocol.host(self.plan)
 
     def beginning(self) -> list[Frame]:
-        """What else is on the bus at the beginning of every cycle, before the host's frames."""
+        """Returns the other frames at the beginning of a cycle, before the host's."""
         if self.master is None:
             return []
         sync = self.master.sync()
@@ -75,7 +75,7 @@ class Rig:
 
     @property
     def motors(self) -> list[Motor]:
-        """Of the right and the left wheel."""
+        """The motors of the right and the left wheel."""
         return [motor for drive in self.drives for motor in drive.motors]
 
     def drive_of(self, wheel: int) -> Drive:
@@ -97,7 +97,7 @@ class Rig:
                     self._from_drive(time_ns, drive.receive(time_ns, frame))
 
     def cycle(self, right: float = 0.0, left: float = 0.0, command: bool = True) -> None:
-        """One bus cycle at `time_ns`, which then is the next one's."""
+        """Runs one cycle at `time_ns`, and advances `time_ns` to the next."""
         self.advance(self.time_ns)
         if command:
             self.to_drives(self.time_ns, self.beginning())
@@ -151,7 +151,7 @@ def make_drives(plan: DrivePlan) -> list[Drive]:
 
 
 def enabled_rig(name: str, right: float = 0.5, left: float = -0.25, **changes: Any) -> Rig:
-    """A rig whose wheels have these torques."""
+    """Returns a rig with enabled drives and these torques [N m] at the wheels."""
     rig = make_rig(name, **changes)
     rig.bring_up()
     while rig.time_ns < 0:  # the run begins
@@ -162,7 +162,7 @@ def enabled_rig(name: str, right: float = 0.5, left: float = -0.25, **changes: A
 
 
 def instants(rig: Rig, from_ns: int, to_ns: int, step_ns: int = MS) -> Iterator[int]:
-    """Lets time pass in small steps, without the host."""
+    """Lets time pass in small steps without the host; yields each instant."""
     for time_ns in range(from_ns, to_ns + 1, step_ns):
         rig.advance(time_ns)
         yield time_ns
@@ -193,7 +193,7 @@ def test_right_is_right_and_forward_is_positive(name: str) -> None:
 @given(st.lists(st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)), min_size=2, max_size=30))
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_reported_torques_are_the_commanded_ones(protocol: str, wanted: list[tuple[float, float]]) -> None:
-    """Without lag and ramp: what a cycle commands is the mean that the next one hears, to the bit."""
+    """Without lag and ramp, the torque commanded in a cycle is the mean reported in the next, to the bit."""
     rig = make_rig(protocol)
     rig.bring_up()
     heard = []
@@ -246,7 +246,7 @@ def test_watchdog_trips_exactly_when_it_says(name: str) -> None:
 
 
 def test_watchdog_trips_at_its_time_even_if_time_is_asked_later(name: str) -> None:
-    """Two rigs, one asked every millisecond: their wheels, which the torque turns, come to the same place."""
+    """Of two rigs only one is advanced every millisecond.  The wheels of both turn by the same angle."""
     one, other = (enabled_rig(name, watchdog_ns=73_456_789) for _ in range(2))
     end_ns = one.time_ns + 2 * WATCHDOG_NS
     for _ in instants(one, one.time_ns, end_ns):
@@ -332,7 +332,7 @@ def test_of_two_causes_both_must_go(name: str) -> None:
 
 
 def test_after_a_fault_the_first_torque_must_be_zero(name: str) -> None:
-    """Frames that bring a healthy host's torque arrive where a fault was cleared without it: they are refused."""
+    """A drive whose fault was cleared refuses torques of a host that does not know of the fault."""
     rig = enabled_rig(name)
     rig.cycle(0.5, -0.25)
     torque_frames = [frame for time_ns, frame in rig.commanded if time_ns == rig.time_ns - PERIOD_NS]
@@ -348,7 +348,7 @@ def test_after_a_fault_the_first_torque_must_be_zero(name: str) -> None:
 
 
 def test_before_the_run_drives_are_brought_up_from_whatever_fault_they_are_in(name: str) -> None:
-    """An earlier run has left them so, say; and one that happens meanwhile is no reason not to begin."""
+    """Faults may be left over from an earlier run or happen during the bring-up; both are cleared."""
     rig = make_rig(name, recover_ns=None)
     rig.time_ns = -4 * CYCLES * PERIOD_NS
     rig.bring_up()
@@ -444,7 +444,7 @@ def test_stuck_torque_stays_whatever_is_commanded(name: str) -> None:
 @pytest.mark.parametrize("how", ["stop", "estop"])
 @pytest.mark.parametrize("faulty", [False, True])
 def test_stop_takes_the_torque_and_start_gives_it_back(name: str, how: str, faulty: bool) -> None:
-    """Also if something was wrong until then, though a fault in between is never cleared by itself here."""
+    """`start` also clears an old fault, although faults are never cleared automatically in this test."""
     rig = enabled_rig(name)
     if faulty:
         rig.inject(0, Fault.ENCODER_LOSS)
@@ -478,7 +478,7 @@ def test_stop_takes_the_torque_and_start_gives_it_back(name: str, how: str, faul
 
 
 def test_an_estop_that_was_lost_is_repeated(name: str) -> None:
-    """By its own frames: nothing else of the host gets through."""
+    """The emergency stop itself is repeated: no other frame of the host gets through in this test."""
     rig = enabled_rig(name)
     estops = {frame[:2] for frame in rig.host.estop(rig.time_ns)}
     repeated = []
@@ -495,7 +495,7 @@ def test_an_estop_that_was_lost_is_repeated(name: str) -> None:
 
 
 def test_a_quick_stop_is_left_to_the_drive() -> None:
-    """No other controlword follows while it stops as it is configured to."""
+    """The host sends no other controlword while the drive makes its configured quick stop."""
     rig = enabled_rig("cia402")
     rig.to_drives(rig.time_ns, rig.host.estop(rig.time_ns))
     rig.deaf = True  # and the drives are slow to say that they stopped
@@ -508,7 +508,7 @@ def test_a_quick_stop_is_left_to_the_drive() -> None:
 
 @pytest.mark.parametrize("cycles", [0, 1, 2, 3])
 def test_an_estop_that_is_over_at_once(name: str, cycles: int) -> None:
-    """Its fault is known to the host only after the start."""
+    """The host learns of the fault by the emergency stop only after `start`."""
     rig = enabled_rig(name)
     rig.to_drives(rig.time_ns, rig.host.estop(rig.time_ns))
     assert rig.torques() == [0.0, 0.0]
@@ -520,7 +520,7 @@ def test_an_estop_that_is_over_at_once(name: str, cycles: int) -> None:
 
 
 def test_a_host_that_begins_anew(name: str) -> None:
-    """It meets drives that were enabled, and stopped because the host before it was gone."""
+    """The drives were enabled, and their watchdog has stopped them since the old host was gone."""
     rig = enabled_rig(name, recover_ns=100 * MS)
     rig.cycles(20, command=False)
     assert rig.torques() == [0.0, 0.0]
@@ -531,7 +531,7 @@ def test_a_host_that_begins_anew(name: str) -> None:
 
 
 def test_a_host_that_begins_anew_while_drives_are_enabled(name: str) -> None:
-    """It has their wheels without a fault, or after one: but no torque that it did not ask for."""
+    """The new host gets both wheels enabled, with or without a fault in between, and never a torque that it did not command."""
     rig = enabled_rig(name, recover_ns=100 * MS)
     rig.host = rig.new_host()
     rig.cycle()
@@ -583,7 +583,7 @@ def test_heat_is_a_fault_of_its_own(name: str) -> None:
 @given(st.lists(st.integers(1, 45_000), min_size=1, max_size=30))
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_what_is_sent_does_not_depend_on_when_time_is_asked(protocol: str, steps_us: list[int]) -> None:
-    """A drive alone: the same frames in the same order, whether time passes in these steps or at once, and no sooner."""
+    """A drive sends the same frames in the same order, at their times, whether time passes in steps or at once."""
     plan = drive_plan(protocol)
     one, other = make_drives(plan)[0], make_drives(plan)[0]
     time_ns = -77 * MS
@@ -602,7 +602,7 @@ def test_what_is_sent_does_not_depend_on_when_time_is_asked(protocol: str, steps
 
 @pytest.mark.parametrize("fault", ON_DEMAND)
 def test_faults_may_come_and_go_before_time_is_asked(name: str, fault: Fault) -> None:
-    """What was due before is not lost, and time does not run backwards inside."""
+    """Frames that were due before are not lost, and time does not run backwards in the drive."""
     rig = enabled_rig(name)
     later_ns = rig.time_ns + 2 * WATCHDOG_NS + 3 * MS
     drive = rig.drives[0]

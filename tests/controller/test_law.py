@@ -79,7 +79,7 @@ def test_nu_is_the_law_of_the_paper(time_scales, seed):
     np.testing.assert_allclose(nu, np.concatenate(expected), rtol=1e-11, atol=1e-10)
 
 
-def test_all_ones_of_the_paper_couple_what_it_names():
+def test_all_ones_couplings_of_the_paper():
     """With three time scales K̄_sr, K̄_sc, K̄_rs, K̄_rc, K̄_cs and K̄_cr are all ones; within Z_s there is no coupling."""
     _, plan = load(PAPER)
     s, r, c = 12, 4, 2
@@ -176,7 +176,7 @@ def test_lead_is_the_law_taken_at_the_error_to_come(seed, lead):
         np.testing.assert_allclose(found, solved, rtol=1e-8, atol=1e-9)
 
 
-def test_no_lead_is_the_law_as_it_stands():
+def test_lead_zero_is_the_law_without_look_ahead():
     _, plan = paper_like(1, "multi")
     for block in plan.blocks:
         gains = BlockGains.of(replace(plan, lead=0.5), block, lead=0.0)

@@ -16,9 +16,8 @@ from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.plugins import Part
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load, parse
-from echelon.sim.results.summary import summarise
 from support.runs import SCENARIOS, plan_of, trace_of
-from support.synthetic import run_facts
+from support.synthetic import claims_of
 from support.trees import PAPER_TREE
 from support.watched import Watched, random_plan
 
@@ -69,7 +68,7 @@ class Witness(Law):
 
 @pytest.mark.parametrize("coupling", [0.0, 0.5])
 @pytest.mark.parametrize("avoidance", [False, True])
-def test_asked_block_by_block_the_linear_law_is_what_its_matrices_are(coupling, avoidance):
+def test_the_linear_law_block_by_block_agrees_with_its_matrices(coupling, avoidance):
     plan = random_plan(PAPER_TREE, 3, "three", coupling, avoidance)
     expected, found = (Watched(one, 3).commanded(0) for one in (plan, of_another(plan, Same())))
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
@@ -77,7 +76,7 @@ def test_asked_block_by_block_the_linear_law_is_what_its_matrices_are(coupling, 
 
 
 @pytest.mark.parametrize("tree", [PAPER_TREE, ((None,), (None, (None, None)), None)])
-def test_a_law_of_others_is_in_the_tree_what_it_is_to_all_at_once(tree):
+def test_a_law_that_is_not_built_in_gives_the_same_in_the_tree_and_centrally(tree):
     """State, weight and time are included.  A group of a single robot has no shape, so the law is not called for it."""
     plan = of_another(random_plan(tree, 5, "multi", 0.5, avoidance=True), Witness())
     central, run = CentralLaw(plan), Watched(plan, 5)
@@ -109,7 +108,7 @@ def test_the_tree_weighs_coupling_and_avoidance_as_the_law_says():
     assert np.abs(heavy - deaf).max() > 1
 
 
-def test_a_law_is_not_asked_while_the_node_hears_too_little():
+def test_a_law_is_not_called_while_the_node_misses_a_message():
     """States take 2 ms.  Until then the node commands nothing, and the state of the law does not change."""
     plan = of_another(random_plan((None, None), 1, "three", 0.0, avoidance=False, duration=0.004), Witness())
     late = tuple(
@@ -123,7 +122,7 @@ def test_a_law_is_not_asked_while_the_node_hears_too_little():
     assert states[0][1] == pytest.approx(0.009)
 
 
-def test_what_a_law_is_told_of_its_block():
+def test_the_block_that_a_law_gets():
     plan = plan_of("lab", "law.lead=0.25", "formation.period=0.05", 'law.gains=[{k1=2.0,k2=3.0},{block="g2",k1=5.0}]')
     blocks = {block.name: law_block(plan, block) for block in plan.blocks}
     assert [(one.name, one.layer, one.size, one.sigma, one.period_s, one.lead) for one in blocks.values()] == [
@@ -261,7 +260,7 @@ def test_a_law_that_fails_in_a_run_is_named_with_its_block(does: str, says: str)
         (make_weight, "word", "weight raised ValueError: could not convert string to float: 'x'"),
     ],
 )
-def test_whatever_else_a_law_says_is_checked_too(make, does: str, says: str) -> None:
+def test_other_answers_of_a_law_are_checked(make, does: str, says: str) -> None:
     with pytest.raises(PartRunError) as caught:
         make(of_faulty(does), BLOCK)
     assert str(caught.value).startswith(f"my_laws.py:Faulty of block g1: {says}")
@@ -273,23 +272,25 @@ def test_where_the_run_diverged_a_law_may_fail() -> None:
         assert np.isnan(make_nu(of_faulty("e * np.nan"), BLOCK)(0.0, lost, ZERO, ZERO, ZERO[:0])).all()
 
 
-def test_laws_of_this_package_cost_no_checks() -> None:
+def test_built_in_laws_are_not_checked() -> None:
     plan = plan_of("lab")
     assert make_nu(plan.law, BLOCK).__module__ == "echelon.controller.laws.linear"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["integral", "sliding"])
 def test_shipped_scenarios_of_other_laws_hold(name: str) -> None:
     plan = plan_of(name)
-    claims = summarise(trace_of(plan), [], None, run_facts()).claims
+    claims = claims_of(trace_of(plan))
     assert [claim.block for claim in claims] == ["intra", "inter", "centroid"]
     assert all(claim.outcome == "passed" for claim in claims), claims
 
 
-def test_what_sliding_claims_takes_the_linear_law_nine_times_as_long() -> None:
+@pytest.mark.slow
+def test_the_linear_law_takes_nine_times_as_long_as_sliding() -> None:
     plan = plan_of("lab", "claims=[{block='intra',settled_by=1.0,band=1e-4},{block='inter',settled_by=1.0,band=1e-4}]")
-    intra, inter = (claim.measured for claim in summarise(trace_of(plan), [], None, run_facts()).claims)
+    intra, inter = (claim.measured for claim in claims_of(trace_of(plan)))
     plan = plan_of("sliding")
-    quick = [claim.measured for claim in summarise(trace_of(plan), [], None, run_facts()).claims]
+    quick = [claim.measured for claim in claims_of(trace_of(plan))]
     assert intra > 8.5 * quick[0]
     assert inter > 8.5 * quick[1]

@@ -11,7 +11,7 @@ from echelon import controller
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.laws.in_tree import BlockGains
 from echelon.messages import NULL, STATE_FIELDS, Channel, Message
-from echelon.plan.layout import sized
+from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, LinkPlan, Plan
 from echelon.sim.engines.in_process import Engine
 from support.trees import PAPER_TREE, plan_of, scenario, trees, with_random_gains
@@ -46,11 +46,11 @@ def test_tree_computes_what_the_central_law_does(tree, seed, time_scales, coupli
     assert run.engine.messages == len(run.said)
 
 
-def test_nine_robots_that_avoid_each_other_do_feel_it():
+def test_avoidance_changes_the_accelerations_of_nine_robots():
     """Avoidance changes the accelerations of nine robots, so the random trees above do test it."""
     plan = random_plan(PAPER_TREE, 5, "three", 0.5, avoidance=True)
     near = Watched(plan, 5).commanded(0)
-    far = Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 5).commanded(0)
+    far = Watched(with_message_sizes(replace(plan, avoidance=replace(NEAR, enabled=False))), 5).commanded(0)
     assert np.abs(near - far).max() > 1.0
 
 
@@ -80,7 +80,7 @@ def test_torque_is_that_of_the_acceleration(tree, seed):
         np.testing.assert_allclose(did[[FIELD["tau_right"], FIELD["tau_left"]]], u, rtol=1e-5, atol=1e-5)
 
 
-def test_null_until_every_child_was_heard():
+def test_messages_are_null_until_every_child_has_sent():
     """The states of one robot take 2 ms.  Until then its leader, the nodes above, and all members below them send null
     messages."""
     tree = ((None, None), (None, None))
@@ -103,7 +103,7 @@ def test_null_until_every_child_was_heard():
     assert (run.states(run.instants[3])[:, FIELD["tau_right_peak"]] > 0).all()
 
 
-def test_a_node_whose_parent_is_silent_commands_nothing():
+def test_a_node_without_a_reference_commands_nothing():
     plan = random_plan(((None, None), (None, None)), 1, "three", 0.0, avoidance=False)
     leader = Watched(plan, 1).engine.roles[plan.nodes[0].index]
     gather, steer = leader.stages
@@ -124,12 +124,12 @@ def slow_root(ratio: int, coupling: float, avoidance: bool, ticks: int = 9) -> P
     table["formation"]["period"] = 0.001 * ratio
     table["law"] = {"epsilon": [0.5, 0.5], "lead": 0.5}
     plan = with_random_gains(plan_of(table), np.random.default_rng(3), coupling)
-    return sized(replace(plan, avoidance=NEAR)) if avoidance else plan
+    return with_message_sizes(replace(plan, avoidance=NEAR)) if avoidance else plan
 
 
 @pytest.mark.parametrize("ratio", [2, 3])
 @pytest.mark.parametrize("coupling", [0.0, 0.5])
-def test_slow_coordinator_holds_what_it_said(ratio, coupling):
+def test_the_references_of_a_slow_coordinator_are_held(ratio, coupling):
     """Leaders use states of every T.  ν of inter and centroid, and the error rates of other blocks, are those of the last
     multiple of k T."""
     plan = slow_root(ratio, coupling, avoidance=False)
@@ -162,7 +162,7 @@ def test_slow_coordinator_holds_what_it_said(ratio, coupling):
 def test_slow_coordinator_hands_down_forces_of_its_own_pairs_only():
     """Forces within a group are those of every T; forces between groups are those of the last multiple of k T."""
     plan = slow_root(3, 0.0, avoidance=True)
-    run, quiet = Watched(plan, 7), Watched(sized(replace(plan, avoidance=replace(NEAR, enabled=False))), 7)
+    run, quiet = Watched(plan, 7), Watched(with_message_sizes(replace(plan, avoidance=replace(NEAR, enabled=False))), 7)
     np.testing.assert_array_equal(run.states(0), quiet.states(0))
     time_ns = 3_000_000
     states = run.states(time_ns)
@@ -207,7 +207,7 @@ def _forces_within(x: Array) -> Array:
     return f
 
 
-def test_links_of_a_plan_are_those_its_roles_listen_to():
+def test_links_of_a_plan_are_the_inputs_of_its_roles():
     plan = random_plan((None, (None, (None, None)), None), 3, "multi", 0.5, avoidance=True)
     run = Watched(plan, 3)
     listened = {

@@ -68,7 +68,7 @@ def test_force_is_minus_the_gradient_of_all_pairs_potential():
         assert np.abs(found).max() > 1
 
 
-def test_forces_of_all_pairs_cancel_and_turn_nothing():
+def test_forces_of_all_pairs_have_no_sum_and_no_moment():
     for x in configurations():
         found = forces()(x)
         scale = np.abs(found).max()
@@ -95,7 +95,7 @@ def test_nothing_beyond_the_sensing_radius():
     assert far[0, 0] < 0 < far[1, 0]
 
 
-def test_cap_holds_outside_and_is_the_force_inside():
+def test_the_force_is_capped_outside_and_equals_the_cap_inside():
     plan = replace(PLAN, force_limit=40.0)
     for s in (1e-9, 0.1, 0.4999, 0.5, 0.5 + 1e-9, 0.51):
         assert pair(s, plan) == pytest.approx(40.0)
@@ -118,7 +118,7 @@ def test_pairs_between_groups_are_those_of_different_groups_once():
     assert forces(robots=1)(np.zeros((1, 2))) is None
 
 
-def test_pairs_of_one_group_do_not_feel_each_other():
+def test_pairs_of_one_group_have_no_force():
     of_groups = PairForces(*pairs_between([range(0, 2), range(2, 3)]), 3, PLAN)
     x = np.array([(0.0, 0.0), (1.0, 0.0), (0.5, 1.5)])
     within = forces(robots=2)(x[:2])

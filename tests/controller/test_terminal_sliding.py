@@ -183,7 +183,7 @@ def test_finite_against_exponential_in_numbers():
 
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS[::3])
 @pytest.mark.parametrize("w", [0.05, -0.3])
-def test_a_constant_acceleration_leaves_what_the_docstring_says(gamma, beta, kappa, w):
+def test_the_error_under_a_constant_acceleration_is_the_closed_form(gamma, beta, kappa, w):
     sigma, law = 0.5, TerminalSliding(gamma=gamma, beta=beta, kappa=kappa)
     kept = np.sign(w) * (sigma**2 * abs(w) / kappa) ** (gamma / (2 - gamma))
     assert abs(kept) < 3
@@ -222,7 +222,7 @@ def test_look_ahead_solves_its_equation(e, e_dot, parameters, lead, T):
 
 
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS)
-def test_what_remains_of_a_held_loop_is_the_closed_form(gamma, beta, kappa):
+def test_the_remaining_motion_of_a_held_loop_is_the_closed_form(gamma, beta, kappa):
     """e = 0 at all ticks, while e' = ±a alternates.  This is a motion of the loop, and runs that reach it stay in it."""
     law, sigma, T = TerminalSliding(gamma=gamma, beta=beta, kappa=kappa), 0.5, 0.01
     a = (T / (2 * sigma) * (beta / gamma + kappa * beta ** (1 - 2 / gamma))) ** (1 / (gamma - 1))
@@ -275,14 +275,14 @@ def test_runs_tend_to_the_continuous_motion_as_the_period_falls():
     assert off[1] / off[2] > 1.8
 
 
-def test_gains_of_the_scenario_are_not_its_own():
+def test_terminal_sliding_does_not_use_the_gains_of_the_scenario():
     law = REGISTRY.make("laws", "terminal_sliding", {}, Path()).made
     assert law.uses == {"lead"}
     changed = replace(block(), K_1=5 * np.eye(1), K_2=7 * np.eye(1))
     assert answer(law, changed, 0.3, 0.1) == answer(law, block(), 0.3, 0.1)
 
 
-def test_lost_numbers_give_no_numbers():
+def test_overflowing_inputs_give_nan():
     law = TerminalSliding()
     for lead in (0.0, 1.0):
         for e in (np.nan, 1e300):

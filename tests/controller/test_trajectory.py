@@ -33,7 +33,7 @@ def test_derivatives_are_those_of_the_position(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_many_instants_are_one_by_one(kind):
+def test_sample_agrees_with_single_instants(kind):
     trajectory, times = made(kind), np.array([0.0, 0.7, 3.0])
     many = sample(trajectory, times)
     assert many.shape == (3, 3, 2)

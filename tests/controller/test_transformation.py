@@ -38,7 +38,7 @@ def test_rows_are_their_definitions(weights, seed):
 
 
 @pytest.mark.parametrize("weights", [[], [0], [1, -1], [2, 0, 1]])
-def test_node_matrix_refuses_what_is_no_weight(weights):
+def test_node_matrix_refuses_wrong_weights(weights):
     with pytest.raises(ValueError, match="positive weight"):
         node_matrix(weights)
 
@@ -126,7 +126,7 @@ def test_backward_undoes_forward_for_one_and_for_many(tree, seed):
 
 @SETTINGS
 @given(trees(), SEEDS)
-def test_shape_does_not_feel_where_the_formation_stands(tree, seed):
+def test_shape_variables_do_not_depend_on_the_place_of_the_formation(tree, seed):
     random = np.random.default_rng(seed)
     cbt = Transformation(plan_of(scenario(tree, random)))
     x, shift = random.normal(size=(len(cbt.matrix), 2), scale=10), np.array([123.0, -45.0])

@@ -1,13 +1,14 @@
 """Layouts of messages in random trees: against the messages that roles send, and against the central law."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
 from echelon.controller.laws.central import CentralLaw
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, Channel, Message
-from echelon.plan.layout import CENTROID, POSITION, NodeLayout, acceleration_of, said_by
+from echelon.plan.layout import CENTROID, POSITION, NodeLayout, acceleration_of, message_sizes
 from echelon.plan.plan import NodePlan, Plan
 from echelon.sim.engines.in_process import Engine
 from support.trees import plan_of, random_epsilon, scenario, trees, with_random_gains
@@ -38,14 +39,15 @@ def nodes_below(plan: Plan, index: int) -> list[int]:
     return [*(node for child in plan.formation[index].children for node in nodes_below(plan, child)), index]
 
 
+@pytest.mark.slow
 @SETTINGS
 @given(trees(max_robots=8), st.sampled_from(["mirror", "closed"]), COUPLINGS, st.booleans())
-def test_what_may_be_said_is_what_is_said(tree, path, coupling, avoidance):
+def test_roles_send_the_messages_of_the_layout(tree, path, coupling, avoidance):
     """Roles send on exactly the channels of the layout, with the numbers of values of the layout."""
     plan = made(tree, coupling, avoidance, path)
     said: list[Message] = []
     Engine(plan, said.append).run()
-    announced = said_by(plan)
+    announced = message_sizes(plan)
     mirrored = {(len(plan.formation), Channel.FRAMES)} if path == "mirror" else set()
     assert {(message.source, message.channel) for message in said} == set(announced) - mirrored
     for message in said:
@@ -58,7 +60,7 @@ def test_what_may_be_said_is_what_is_said(tree, path, coupling, avoidance):
 
 @SETTINGS
 @given(trees(max_robots=10), COUPLINGS, st.booleans())
-def test_parts_stand_side_by_side_and_fill_the_message(tree, coupling, avoidance):
+def test_parts_are_adjacent_and_fill_the_message(tree, coupling, avoidance):
     plan = made(tree, coupling, avoidance)
     for node in plan.nodes:
         layout = NodeLayout.of(plan, node)
@@ -77,7 +79,7 @@ def test_parts_stand_side_by_side_and_fill_the_message(tree, coupling, avoidance
 
 @SETTINGS
 @given(trees(max_robots=10), COUPLINGS, st.booleans())
-def test_parts_hold_what_their_names_say(tree, coupling, avoidance):
+def test_parts_hold_the_values_of_their_names(tree, coupling, avoidance):
     plan = made(tree, coupling, avoidance)
     said: dict[tuple[int, Channel], np.ndarray] = {}
     Engine(plan, lambda message: said.setdefault((message.source, message.channel), message.values)).run()
@@ -131,6 +133,6 @@ def _check_part_of(plan: Plan, parent: NodePlan, child: NodePlan, said: dict[tup
         )
 
 
-def test_a_robots_state_begins_as_a_groups():
+def test_a_state_begins_with_the_fields_of_a_group_state():
     assert STATE_FIELDS[CENTROID] == GROUP_FIELDS
     assert STATE_FIELDS[POSITION] == ("x", "y")

@@ -55,7 +55,7 @@ def said(text: str, *overrides: str) -> str:
     return ""
 
 
-def test_the_base_is_right():
+def test_the_base_scenario_loads():
     assert said(BASE) == ""
 
 
@@ -278,7 +278,7 @@ def test_overrides_make_the_tables_and_arrays_they_need():
         ["links[0].delay.min=0.1", "links.delay.max=0.1", "links.delay=0.1", "links.loss=0.5"],
     ],
 )
-def test_an_entry_of_an_array_is_named_by_its_number_or_is_the_only_one(overrides):
+def test_an_override_of_an_array_may_omit_the_number_of_a_single_entry(overrides):
     (rule,) = parse(BASE, "t.toml", overrides)[0].links
     assert (rule.delay, rule.loss) == (0.1, 0.5)
 
@@ -297,7 +297,7 @@ def test_entries_of_arrays_in_arrays_and_tables():
         (4, "links has 4 entries; give its number: links.0.delay, …, links.3.delay"),
     ],
 )
-def test_of_several_entries_one_must_be_named(rules, says):
+def test_an_override_of_an_array_with_several_entries_needs_a_number(rules, says):
     text = BASE + "[[links]]\nloss = 0.1\n" * rules
     assert said(text, "links.delay=0.1") == f"t.toml with --set links.delay=0.1: {says}"
 
@@ -312,7 +312,7 @@ def lines(text: str, *overrides: str) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_all_mistakes_in_values_are_told():
+def test_all_mistakes_in_values_are_reported():
     text = BASE.replace("duration = 1.0", "duration = 0").replace("mass = 10.0", "maas = 10.0")
     assert lines(text.replace("rate = 0.5", ""), "seed=-1") == [
         "t.toml: duration = 0: must be greater than 0",
@@ -322,7 +322,7 @@ def test_all_mistakes_in_values_are_told():
     ]
 
 
-def test_all_mistakes_in_what_fits_together_are_told():
+def test_all_mistakes_between_tables_are_reported():
     overrides = ["duration=0.015", "law.gains=[{block='x'},{block='y'}]", "links=[{source='q'},{source='r'}]"]
     found = lines(BASE, *overrides, "formation.robots.b.start=[0,0]")
     assert [line.split(": ")[1] for line in found] == [
@@ -331,12 +331,12 @@ def test_all_mistakes_in_what_fits_together_are_told():
     ]  # fmt: skip
 
 
-def test_all_overrides_that_cannot_be_applied_are_told():
+def test_all_overrides_that_cannot_be_applied_are_reported():
     found = lines(BASE, "duration", "seed=2", "links.delay=1")
     assert [line.partition(": ")[0] for line in found] == ["t.toml with --set duration", "  with --set links.delay=1"]
 
 
-def test_what_all_robots_inherit_is_told_once():
+def test_a_mistake_that_all_robots_inherit_is_reported_once():
     text = BASE.replace("mass = 10.0\n", "").replace("arm = 0.4\n", "").replace("epsilon = [0.1]", "")
     missing = "missing (neither here, nor in its group, nor in [robot]); the same holds for 1 more"
     assert lines(text) == [
@@ -352,23 +352,23 @@ def test_what_all_robots_inherit_is_told_once():
     assert heavy[2].endswith("must be larger than mass·offset² = 0.4; the same holds for 1 more")
 
 
-def test_no_error_is_endless():
+def test_an_error_shows_a_limited_number_of_lines():
     robots = "".join(f"r{n} = {{ start = [{n}.0, nan] }}\n" for n in range(100))
     found = lines(BASE.replace("b = { start = [1.0, 0.0] }", robots))
     assert len(found) == 21
     assert found[-1] == "  and 80 more"
 
 
-def test_a_default_that_nobody_wrote_is_called_one():
+def test_an_error_about_a_default_calls_it_a_default():
     assert said(BASE.replace("[law]\nepsilon = [0.1]", "")) == (
-        "t.toml: law.epsilon = [0.1, 0.1], its default (the scenario gives none): must have 1 number with "
+        "t.toml: law.epsilon = [0.7, 0.7], its default (the scenario gives none): must have 1 number with "
         "time_scales = 'three', as many as layers of the tree"
     )
     huge = said(BASE.replace("epsilon = [0.1]", "epsilon = [1e-200]"))
     assert huge.startswith("t.toml: law.epsilon = [1e-200]: the gains of ")
 
 
-def test_an_overrides_value_is_one_value():
+def test_the_value_of_an_override_is_a_single_value():
     assert parse(BASE, "t.toml", ["description=1\nname='x'"])[0].description == "1\nname='x'"
 
 
@@ -389,7 +389,7 @@ def test_an_overrides_value_is_one_value():
         (b"a\0b = 1", "not TOML: "),
     ],
 )
-def test_files_that_are_no_scenario(tmp_path, content, line):
+def test_files_that_are_not_scenarios(tmp_path, content, line):
     path = tmp_path / "x.toml"
     path.write_bytes(content)
     with pytest.raises(ScenarioError) as caught:
@@ -538,6 +538,7 @@ TABLES = {name: tomlkit.parse(text).unwrap() for name, text in TEXTS_OF.items()}
 fuzz = settings(max_examples=1500, suppress_health_check=list(HealthCheck))
 
 
+@pytest.mark.slow
 @fuzz
 @given(mutated())
 def test_mutated_scenarios_load_or_are_explained(text):
@@ -558,6 +559,7 @@ def override_keys() -> list[str]:
     return sorted(found | set(more))
 
 
+@pytest.mark.slow
 @fuzz
 @given(
     st.sampled_from(sorted(TEXTS_OF)),

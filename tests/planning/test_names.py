@@ -39,6 +39,7 @@ def plain(text: str) -> str:
     return re.sub(r"(?<=[a-z])-(?=[a-z0-9])", "_", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["inprocess", "processes"])
 def test_a_run_with_hyphens_in_all_names(engine: str, tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(TEXT)
@@ -62,7 +63,7 @@ def test_a_run_with_hyphens_in_all_names(engine: str, tmp_path: Path) -> None:
     assert " can-b " in (out / "can.log").read_text()
 
 
-def test_the_default_folder_is_called_after_the_scenario(tmp_path: Path) -> None:
+def test_the_default_folder_begins_with_the_name_of_the_scenario(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(TEXT)
     done = echelon("run", "x.toml", "--engine", "inprocess", "--quiet", "--no-report", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -78,11 +79,11 @@ def test_the_default_folder_is_called_after_the_scenario(tmp_path: Path) -> None
         (("can-a =", "can_b ="), "can: buses: 'can-b' must differ from other names by more than hyphens"),
     ],
 )
-def test_names_that_topics_could_not_tell_apart(change: tuple[str, str], says: str) -> None:
+def test_names_that_are_equal_in_topics_are_refused(change: tuple[str, str], says: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         parse(TEXT.replace(*change, 1), "t.toml")
     assert str(caught.value).startswith(f"t.toml: {says}")
 
 
-def test_topics_of_names_without_hyphens_are_as_they_are() -> None:
+def test_topics_keep_names_without_hyphens() -> None:
     assert frame_topics(plan_of("drives")) == ["/can/can0/frames", "/can/can1/frames", "/can/can2/frames"]

@@ -132,7 +132,7 @@ def test_robots_inherit_level_by_level():
 
 
 @pytest.mark.parametrize("key", ["mass", "inertia", "wheel_radius", "arm", "offset"])
-def test_what_no_level_says_is_missing(key):
+def test_a_key_that_no_level_gives_is_missing(key):
     text = re.sub(rf"(, )?{key} = [0-9.]+", "", grouped(2)).replace("{ , ", "{ ")
     assert refusal(text).startswith(f"formation.groups.g1.robots.r0.{key}: missing (neither here")
 
@@ -165,7 +165,7 @@ def test_robots_that_start_in_one_place_are_refused():
     )
 
 
-def test_robots_that_avoid_each_other_start_apart():
+def test_robots_that_avoid_each_other_must_start_apart():
     radii = ("avoidance.avoidance_radius=1.5", "avoidance.sensing_radius=9")
     plan_of(grouped(2), *radii)
     plan_of(grouped(2), "avoidance.enabled=true")
@@ -189,7 +189,7 @@ def test_nanoseconds(seconds, ns):
 
 
 @pytest.mark.parametrize("seconds", [1e-10, 1.5e-9, 1 / 3, 5e-324, 4.7e9, 1e300, 1.7e308])
-def test_what_is_no_number_of_nanoseconds(seconds):
+def test_durations_that_are_not_whole_nanoseconds_are_refused(seconds):
     with pytest.raises(PlanError, match=r"^k = .*: must be a whole number of nanoseconds"):
         nanoseconds(seconds, "k")
 
@@ -235,7 +235,7 @@ def test_layers_have_periods_of_their_own():
     assert {link.period_ns for link in plan.links_into(0)} == {5_000_000}
 
 
-def test_the_display_shows_no_more_than_there_is():
+def test_the_display_period_is_at_least_the_acceleration_period():
     assert paper("record.display_period=0.0001").display_period_ns == 1_000_000
     assert paper("record.display_period=0.5").display_period_ns == 500_000_000
 
@@ -480,7 +480,7 @@ def matches_by_force(pattern: str, path: str) -> bool:
     st.lists(st.sampled_from(["a", "b", "*", "**"]), min_size=1, max_size=5).map("/".join),
     st.lists(st.sampled_from(["a", "b"]), min_size=1, max_size=5).map("/".join),
 )
-def test_wildcards_match_what_trying_everything_matches(pattern, path):
+def test_wildcards_match_as_a_search_of_all_possibilities(pattern, path):
     assert path_matches(pattern, path) == matches_by_force(pattern, path)
 
 

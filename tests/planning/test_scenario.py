@@ -88,6 +88,7 @@ LINES = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=200, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(SCENARIOS), st.lists(LINES, min_size=1, max_size=5))
 def test_any_effective_scenario_reads_back(path, overrides):
@@ -128,7 +129,7 @@ def test_tables_are_frozen_and_know_their_keys(model):
 
 
 @pytest.mark.parametrize("number", [True, False, "1", "nan", math.nan, None, [1.0]])
-def test_what_is_no_number_is_refused_as_one(number):
+def test_values_that_are_not_numbers_are_refused(number):
     for model, fields_of in ((RobotTable, ["mass", "offset", "torque_limit"]), (Shape, ["side", "rotation", "angle"])):
         for name in fields_of:
             if number is not None or (model is Shape and name != "side"):
@@ -158,7 +159,7 @@ def test_names(name):
         Scenario.model_validate(scenario.model_dump() | {"name": name}, context=PartContext(REGISTRY, Path()))
 
 
-def test_shipped_scenarios_are_what_they_say():
+def test_shipped_scenarios_match_their_descriptions():
     assert {path.stem for path in SCENARIOS} >= {"paper", "lab"}
     for path in SCENARIOS:
         scenario, plan = load(path)

@@ -55,7 +55,7 @@ def test_draws_are_philox_4x64_at_the_messages_counter():
 
 
 @given(plans, seeds, st.permutations(range(0, 1300, 13)))
-def test_a_fate_does_not_depend_on_what_was_asked_before(plan, seed, numbers):
+def test_a_fate_does_not_depend_on_earlier_calls(plan, seed, numbers):
     in_order = made(plan, seed)
     expected = {number: in_order.fate(number) for number in sorted(numbers)}
     shuffled = made(plan, seed)
@@ -64,7 +64,7 @@ def test_a_fate_does_not_depend_on_what_was_asked_before(plan, seed, numbers):
 
 
 @given(plans, seeds)
-def test_fates_asked_in_between_change_nothing(plan, seed):
+def test_calls_of_fate_do_not_change_the_newest(plan, seed):
     quiet, asked = made(plan, seed), made(plan, seed)
     for tick in range(60):
         time_ns = tick * plan.period_ns
@@ -116,7 +116,7 @@ def test_a_message_is_used_at_the_first_tick_at_or_after_its_arrival(delay, tick
     assert [link.newest(tick * MS) for tick in range(20)] == [max(tick - ticks, -1) for tick in range(20)]
 
 
-def test_one_that_is_overtaken_arrives_but_changes_nothing():
+def test_a_message_that_is_overtaken_arrives_but_changes_nothing():
     plan = replace(UNIFORM, delay_min_ns=0, delay_max_ns=20 * MS, loss=0.0)
     link = made(plan)
     arrivals = sorted((number * MS + (link.fate(number) or 0), number) for number in range(200))
@@ -129,7 +129,7 @@ def test_one_that_is_overtaken_arrives_but_changes_nothing():
 
 
 @given(plans, seeds)
-def test_an_ideal_link_and_one_of_no_delay_and_no_loss_agree(plan, seed):
+def test_an_ideal_link_agrees_with_a_link_without_delay_and_loss(plan, seed):
     ideal = made(replace(plan, delay_min_ns=0, delay_max_ns=0, loss=0.0), seed)
     for time_ns in range(0, 5 * plan.period_ns, max(1, plan.period_ns // 3)):
         newest = ideal.newest(time_ns)
@@ -163,7 +163,7 @@ def test_losses_are_as_frequent_as_the_scenario_says(loss):
 
 
 @pytest.mark.parametrize(("loss", "expected"), [(0.0, 0), (1.0, 5000)])
-def test_never_and_always_mean_it(loss, expected):
+def test_loss_zero_and_one_are_exact(loss, expected):
     link = made(replace(UNIFORM, loss=loss))
     assert sum(link.fate(number) is None for number in range(5000)) == expected
 

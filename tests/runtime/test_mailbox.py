@@ -61,8 +61,9 @@ seeds = st.integers(0, 1000)
 TICKS = 25
 
 
+@pytest.mark.slow
 @given(links_strategy, seeds, st.integers(0, 3), st.randoms(use_true_random=False))
-def test_every_interleaving_is_heard_alike(links, seed, silent, shuffle):
+def test_a_stage_gets_the_same_messages_in_any_order_of_arrival(links, seed, silent, shuffle):
     """Messages come in any order, as late as possible or long before they are used, some twice."""
     mailbox = mailbox_of(links, seed)
     on_the_way = [message_of(link, number, silent) for link in links for number in range(TICKS)]
@@ -127,7 +128,7 @@ def test_on_a_wall_clock_the_newest_that_came_is_used(links, seed, luck):
             assert (message.sequence if message is not None else -1) == used[link.source]
 
 
-def test_a_late_message_is_used_though_a_newer_one_is_wanted():
+def test_a_late_message_is_used_while_a_newer_one_is_missing():
     link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD)
     mailbox = mailbox_of([link])
     mailbox.deliver(message_of(link, 0))
@@ -157,7 +158,7 @@ def held_messages(mailbox: Mailbox) -> int:
 
 @pytest.mark.parametrize("loss", [0.0, 0.5, 0.99, 1.0])
 @pytest.mark.parametrize("delay", [0, 35, 1000])
-def test_memory_is_bounded_however_much_is_lost(loss, delay):
+def test_memory_is_bounded_for_any_loss(loss, delay):
     link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD, delay, delay + 100, loss)
     mailbox, most = mailbox_of([link]), 0
     for number in range(3000):
@@ -195,7 +196,7 @@ def test_stages_share_an_input():
                 assert heard.sequence == tick
 
 
-def test_messages_that_no_link_accounts_for_are_counted():
+def test_messages_of_no_link_are_counted():
     link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD)
     mailbox = mailbox_of([link])
     mailbox.deliver(Message(Channel.COMMAND, 0, 0, 0, np.ones(1)))

@@ -18,7 +18,7 @@ import echelon.runtime.runner
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
-from echelon.runtime.mailbox import LEAD
+from echelon.runtime.mailbox import MAX_AHEAD
 from echelon.runtime.runner import MAX_BATCHES, Runner
 from echelon.runtime.session import Receive
 from echelon.runtime.wire import data_key, decode, encode, split
@@ -192,7 +192,7 @@ def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: i
     assert not any(runner.counts.refused or runner.mailbox.unexpected for runner in runners)
 
 
-def test_a_stall_names_whom_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stall_names_the_members_that_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(echelon.runtime.runner, "STALL_S", 0.02)
     plan, messages = story()
     leader = plan.nodes[1]
@@ -248,7 +248,7 @@ def test_garbage_is_counted_and_dropped() -> None:
     assert member.said == of(messages, robot.index, Channel.STATE)
 
 
-def test_a_watcher_that_takes_nothing_holds_the_role_back_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_observer_that_reads_nothing_blocks_the_role_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(echelon.runtime.runner, "BATCH_BYTES", 1000)
     plan, messages = story()
     robot = plan.robots[0]
@@ -302,7 +302,7 @@ def test_receiving_never_waits_for_a_put_of_the_main_thread() -> None:
     assert member.said == of(messages, robot.index, Channel.STATE)
 
 
-def test_a_role_that_hears_nothing_through_its_links_still_waits_for_its_sources(
+def test_a_role_whose_links_lose_everything_still_waits_for_its_sources(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(echelon.runtime.runner, "STALL_S", 0.02)
@@ -311,7 +311,7 @@ def test_a_role_that_hears_nothing_through_its_links_still_waits_for_its_sources
     member = Member(plan, make_role(plan, robot.index))
     member.thread.start()
     assert member.waiting.wait(TIMEOUT_S)
-    assert LEAD <= len(member.said) <= LEAD + 2
+    assert MAX_AHEAD <= len(member.said) <= MAX_AHEAD + 2
     assert member.waits[0][1] == [robot.parent]
     for command in of(messages, robot.parent, Channel.COMMAND):
         member.receive(command)
@@ -395,7 +395,7 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int 
     return plan, heard_numbers, member.runner
 
 
-def test_on_a_clock_nothing_late_is_nothing_counted() -> None:
+def test_on_a_clock_messages_in_time_are_not_counted_as_late() -> None:
     plan, numbers, runner = on_the_clock(lambda number: 10)
     instants = plan.duration_ns // plan.robots[0].period_ns + 1
     assert numbers == list(range(instants))
@@ -423,7 +423,7 @@ def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
     assert runner.counts.latest_ns == 0  # stages ran at their deadline, not after it
 
 
-def test_keys_of_what_a_member_hears() -> None:
+def test_keys_of_the_inputs_of_a_member() -> None:
     plan = story()[0]
     heard: list[str] = []
     session: Any = SimpleNamespace(

@@ -91,14 +91,14 @@ def test_payloads_arrive_whole_and_in_order(stack: ExitStack, tmp_path: Path, lo
     assert inbox.take(0) == []
 
 
-def test_take_waits_no_longer_than_it_may(stack: ExitStack) -> None:
+def test_take_waits_at_most_its_timeout(stack: ExitStack) -> None:
     session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
     before = time.monotonic()
     assert session.inbox("run/state").take(0.05) == []
     assert time.monotonic() - before >= 0.05
 
 
-def test_a_handler_may_put_what_it_makes_of_a_payload(stack: ExitStack) -> None:
+def test_a_handler_may_put(stack: ExitStack) -> None:
     first, second = pair(stack)
     answers = second.inbox("run/answer")
     answer = first.publisher("run/answer").put
@@ -112,7 +112,7 @@ def test_a_handler_may_put_what_it_makes_of_a_payload(stack: ExitStack) -> None:
     assert taken(answers, 100) == [b"%d!" % number for number in range(100)]
 
 
-def test_a_session_hears_itself(stack: ExitStack) -> None:
+def test_a_session_receives_its_own_payloads(stack: ExitStack) -> None:
     session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
     inbox = session.inbox("run/**")
     session.publisher("run/state").put(b"x")
@@ -169,7 +169,7 @@ def _listen_late(endpoint: str, parent: Connection) -> None:
         parent.send(taken(inbox, 100))
 
 
-def test_whoever_connects_first_loses_nothing_after_the_barrier(stack: ExitStack) -> None:
+def test_nothing_is_lost_after_the_tokens_in_any_order_of_connecting(stack: ExitStack) -> None:
     (endpoint,) = loopback_endpoints(1)
     session = stack.enter_context(Session(listen=[], connect=[endpoint], lockstep=True))
     _, parent = child(stack, _listen_late, endpoint)
@@ -291,7 +291,7 @@ def _relay(endpoint: str, parent: Connection) -> None:
         parent.recv()
 
 
-def test_a_relay_held_up_on_both_sides_goes_on(stack: ExitStack) -> None:
+def test_a_relay_that_is_blocked_on_both_sides_goes_on(stack: ExitStack) -> None:
     (endpoint,) = loopback_endpoints(1)
     child(stack, _relay, endpoint)
     session = stack.enter_context(Session(listen=[], connect=[endpoint], lockstep=True))

@@ -65,7 +65,7 @@ def test_the_order_of_an_instant_in_full():
 
 @SETTINGS
 @given(trees(max_robots=8), st.sampled_from(["mirror", "closed"]))
-def test_stages_hear_what_was_said_in_turns_before(tree, path):
+def test_stages_use_messages_of_earlier_turns(tree, path):
     plan = made(tree, path)
     roles = make_roles(plan)
     for role in roles:

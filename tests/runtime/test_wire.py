@@ -87,7 +87,7 @@ def test_values_are_the_payloads_own_memory(message):
     assert not values.flags.writeable
 
 
-def test_values_that_do_not_lie_in_a_row_are_encoded_in_order():
+def test_values_that_are_not_contiguous_are_encoded_in_order():
     values = np.arange(12.0).reshape(3, 4)
     assert decode(encode(Message(Channel.STATE, 0, 0, 0, values[:, 1]))).values.tolist() == [1.0, 5.0, 9.0]
     assert decode(encode(Message(Channel.STATE, 0, 0, 0, values[::2]))).values.tolist() == [0, 1, 2, 3, 8, 9, 10, 11]

@@ -94,7 +94,11 @@ def test_data_frames(lab: echelon.Run) -> None:
 def test_figures(lab: echelon.Run, name: str, tmp_path: Path) -> None:
     picture = lab.figure(name)
     assert picture._repr_svg_().startswith("<svg")
-    picture.save(tmp_path / "picture.svg")
+    for kind in ("svg", "pdf", "png"):
+        picture.save(tmp_path / f"picture.{kind}")
+        before = (tmp_path / f"picture.{kind}").read_bytes()
+        picture.save(tmp_path / f"picture.{kind}")
+        assert (tmp_path / f"picture.{kind}").read_bytes() == before
     assert (tmp_path / "picture.svg").read_text(encoding="utf-8") == picture.svg
     with pytest.raises(ValueError, match="must end in"):
         picture.save(tmp_path / "picture.gif")

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from echelon.bridge.roles.envelope import Violation
+from echelon.bridge.roles.envelope import Rejection
 from echelon.plan.can_plan import EnvelopePlan
 
 INF = math.inf
@@ -49,14 +49,14 @@ def check_everything_finite_passes_without_limits(module: ModuleType) -> None:
     gate = module.Envelope(FREE)
     for n, torque in enumerate((1.0, -1e300, 5e-324, 0.0, 1e300, -0.0)):
         assert sent(gate, n, torque, -torque) == ""
-    assert gate.violations == Counter()
+    assert gate.rejections == Counter()
 
 
 def check_not_finite(module: ModuleType) -> None:
     for bad in (math.nan, INF, -INF):
-        assert last(module, FREE, [1.0, bad]) == Violation.NOT_FINITE
+        assert last(module, FREE, [1.0, bad]) == Rejection.NOT_FINITE
         gate = module.Envelope(FREE)
-        assert gate.check(0, 0, bad, bad) == (0.0, 0.0, Violation.NOT_FINITE)
+        assert gate.check(0, 0, bad, bad) == (0.0, 0.0, Rejection.NOT_FINITE)
 
 
 def check_torque_limit(module: ModuleType) -> None:
@@ -64,7 +64,7 @@ def check_torque_limit(module: ModuleType) -> None:
         for sign in (1, -1):
             plan = replace(FREE, torque_limit=limit)
             assert last(module, plan, [sign * limit]) == ""
-            assert last(module, plan, [sign * up(limit)]) == Violation.TORQUE
+            assert last(module, plan, [sign * up(limit)]) == Rejection.TORQUE
 
 
 def check_rise_limit(module: ModuleType) -> None:
@@ -76,10 +76,10 @@ def check_rise_limit(module: ModuleType) -> None:
                 begin = ramp[-1]
                 top = abs(begin) + limit
                 assert last(module, plan, [*ramp, sign * top]) == ""
-                assert last(module, plan, [*ramp, sign * up(top)]) == Violation.RISE
+                assert last(module, plan, [*ramp, sign * up(top)]) == Rejection.RISE
                 if limit:  # through zero: only the rise from zero counts
                     assert last(module, plan, [*ramp, -sign * limit]) == ""
-                    assert last(module, plan, [*ramp, -sign * up(limit)]) == Violation.RISE
+                    assert last(module, plan, [*ramp, -sign * up(limit)]) == Rejection.RISE
 
 
 def check_fall_limit(module: ModuleType) -> None:
@@ -94,9 +94,9 @@ def check_fall_limit(module: ModuleType) -> None:
                 assert last(module, plan, [sign * start, sign * bottom]) == ""
                 assert last(module, plan, [sign * start, sign * 9.0]) == ""
                 below = math.nextafter(bottom, -INF)
-                assert last(module, plan, [sign * start, sign * below]) == Violation.FALL
-                assert last(module, plan, [sign * start, -sign * 0.01]) == Violation.FALL
-                assert last(module, plan, [sign * start, 0.0]) == Violation.FALL
+                assert last(module, plan, [sign * start, sign * below]) == Rejection.FALL
+                assert last(module, plan, [sign * start, -sign * 0.01]) == Rejection.FALL
+                assert last(module, plan, [sign * start, 0.0]) == Rejection.FALL
 
 
 def check_change_of_sign(module: ModuleType) -> None:
@@ -104,29 +104,29 @@ def check_change_of_sign(module: ModuleType) -> None:
     for sign in (1, -1):
         ramp = [sign * 0.5, sign * 1.0]
         assert last(module, plan, [*ramp, -sign * 0.5]) == ""
-        assert last(module, plan, [*ramp, -sign * up(0.5)]) == Violation.RISE
+        assert last(module, plan, [*ramp, -sign * up(0.5)]) == Rejection.RISE
         ramp = [sign * 0.5, sign * up(1.0)]
-        assert last(module, replace(plan, rise_limit=0.75), [*ramp, -sign * 0.25]) == Violation.FALL
+        assert last(module, replace(plan, rise_limit=0.75), [*ramp, -sign * 0.25]) == Rejection.FALL
 
 
 def check_window_limit(module: ModuleType) -> None:
     plan = replace(FREE, window_limit=1.5)
     for sign in (1, -1):
         assert last(module, plan, [sign * 1.5]) == ""
-        assert last(module, plan, [sign * up(1.5)]) == Violation.WINDOW  # the window holds the zero at the start
+        assert last(module, plan, [sign * up(1.5)]) == Rejection.WINDOW  # the window holds the zero at the start
         assert last(module, plan, [sign * 0.5, sign * 0.25, -sign * 1.0]) == ""
-        assert last(module, plan, [sign * 0.5, sign * 0.25, -sign * up(1.0)]) == Violation.WINDOW
+        assert last(module, plan, [sign * 0.5, sign * 0.25, -sign * up(1.0)]) == Rejection.WINDOW
         # a torque 250 ms ago is in the window; one nanosecond earlier it is not
         gate = module.Envelope(plan)
         assert sent(gate, 0, sign * 1.0) == ""
-        assert sent(gate, WINDOW, sign * 2.0) == Violation.WINDOW
+        assert sent(gate, WINDOW, sign * 2.0) == Rejection.WINDOW
         for at in (WINDOW + 1, WINDOW + 2):
             gate = module.Envelope(plan)
             assert sent(gate, 0, sign * 1.0) == ""
             assert sent(gate, 1, sign * 1.0) == ""
-            assert sent(gate, at, sign * 3.0) == ("" if at == WINDOW + 2 else Violation.WINDOW)
+            assert sent(gate, at, sign * 3.0) == ("" if at == WINDOW + 2 else Rejection.WINDOW)
     assert last(module, replace(FREE, window_limit=0.0), [0.0, 0.0]) == ""
-    assert last(module, replace(FREE, window_limit=0.0), [0.0, 5e-324]) == Violation.WINDOW
+    assert last(module, replace(FREE, window_limit=0.0), [0.0, 5e-324]) == Rejection.WINDOW
 
 
 def check_age(module: ModuleType) -> None:
@@ -134,21 +134,21 @@ def check_age(module: ModuleType) -> None:
         plan = replace(FREE, stale_ns=stale_ns)
         for now in (-3, 0, 7 * MS):
             assert module.Envelope(plan).check(now, now - stale_ns, 1.0, 2.0) == (1.0, 2.0, None)
-            assert module.Envelope(plan).check(now, now - stale_ns - 1, 1.0, 2.0) == (0, 0, Violation.STALE)
-            assert module.Envelope(plan).check(now, now + 1, 1.0, 2.0) == (0, 0, Violation.FUTURE)
+            assert module.Envelope(plan).check(now, now - stale_ns - 1, 1.0, 2.0) == (0, 0, Rejection.STALE)
+            assert module.Envelope(plan).check(now, now + 1, 1.0, 2.0) == (0, 0, Rejection.FUTURE)
 
 
 def check_clock(module: ModuleType) -> None:
     gate = module.Envelope(FREE)
     assert [sent(gate, now, 1.0) for now in (-5, -5, 10, 10)] == [""] * 4
-    assert gate.check(9, 9, 1.0, 1.0).reason == Violation.CLOCK
-    assert [sent(gate, now, 1.0) for now in (9, 10)] == [Violation.CLOCK, ""]
+    assert gate.check(9, 9, 1.0, 1.0).reason == Rejection.CLOCK
+    assert [sent(gate, now, 1.0) for now in (9, 10)] == [Rejection.CLOCK, ""]
     gate.stop(20)
     gate.stop(15)  # does not turn the gate's clock back
-    assert [sent(gate, now, 1.0) for now in (19, 20)] == [Violation.CLOCK, ""]
-    assert gate.check(30, 31, 0.0, 0.0).reason == Violation.FUTURE  # a refused command also sets the gate's clock
-    assert [sent(gate, now, 1.0) for now in (29, 30)] == [Violation.CLOCK, ""]
-    assert gate.violations == {Violation.CLOCK: 4, Violation.FUTURE: 1}
+    assert [sent(gate, now, 1.0) for now in (19, 20)] == [Rejection.CLOCK, ""]
+    assert gate.check(30, 31, 0.0, 0.0).reason == Rejection.FUTURE  # a refused command also sets the gate's clock
+    assert [sent(gate, now, 1.0) for now in (29, 30)] == [Rejection.CLOCK, ""]
+    assert gate.rejections == {Rejection.CLOCK: 4, Rejection.FUTURE: 1}
 
 
 def check_after_zero_all_begins_anew(module: ModuleType) -> None:
@@ -160,33 +160,33 @@ def check_after_zero_all_begins_anew(module: ModuleType) -> None:
         return gate
 
     gate = risen()
-    assert sent(gate, 4, 1.5, math.nan) == Violation.NOT_FINITE
-    assert sent(gate, 5, 1.5, -1.5) == Violation.RISE  # refused until it starts near zero
+    assert sent(gate, 4, 1.5, math.nan) == Rejection.NOT_FINITE
+    assert sent(gate, 5, 1.5, -1.5) == Rejection.RISE  # refused until it starts near zero
     assert sent(gate, 6, 0.5, -0.5) == ""
     gate = risen()
     gate.stop(4)
-    assert gate.violations == Counter()
+    assert gate.rejections == Counter()
     assert sent(gate, 5, -0.5, 0.5) == ""  # the fall to zero does not count in the window
-    assert [sent(gate, 5 + n, -0.5 * n, 0.0) for n in (2, 3, 4)] == [Violation.FALL, Violation.RISE, Violation.RISE]
-    assert gate.violations == {Violation.FALL: 1, Violation.RISE: 2}
+    assert [sent(gate, 5 + n, -0.5 * n, 0.0) for n in (2, 3, 4)] == [Rejection.FALL, Rejection.RISE, Rejection.RISE]
+    assert gate.rejections == {Rejection.FALL: 1, Rejection.RISE: 2}
     gate = module.Envelope(replace(FREE, window_limit=2.0))
     assert sent(gate, 0, 1.0) == ""
     gate.stop(1)
     assert sent(gate, 2 + WINDOW, 3.0) == ""
     gate.stop(3 + WINDOW)
-    assert sent(gate, 3 + 2 * WINDOW, 3.0) == Violation.WINDOW
+    assert sent(gate, 3 + 2 * WINDOW, 3.0) == Rejection.WINDOW
     gate.stop(3 + 2 * WINDOW)
     assert sent(gate, 4 + 3 * WINDOW, 3.0) == ""
     gate.stop(5 + 3 * WINDOW)
-    assert sent(gate, 4 + 3 * WINDOW, 1.0) == Violation.CLOCK  # zero, at the latest time that the gate knows
-    assert sent(gate, 5 + 4 * WINDOW, 3.0) == Violation.WINDOW
+    assert sent(gate, 4 + 3 * WINDOW, 1.0) == Rejection.CLOCK  # zero, at the latest time that the gate knows
+    assert sent(gate, 5 + 4 * WINDOW, 3.0) == Rejection.WINDOW
 
 
 def check_one_wheel_stops_both(module: ModuleType) -> None:
     plan = replace(FREE, torque_limit=1.0)
-    assert sent(module.Envelope(plan), 0, 2.0, 0.5) == Violation.TORQUE
-    assert sent(module.Envelope(plan), 0, 0.5, 2.0) == Violation.TORQUE
-    assert sent(module.Envelope(plan), 0, 2.0, 2.0) == Violation.TORQUE
+    assert sent(module.Envelope(plan), 0, 2.0, 0.5) == Rejection.TORQUE
+    assert sent(module.Envelope(plan), 0, 0.5, 2.0) == Rejection.TORQUE
+    assert sent(module.Envelope(plan), 0, 2.0, 2.0) == Rejection.TORQUE
 
 
 def check_limits_that_are_none(module: ModuleType) -> None:
@@ -207,7 +207,7 @@ class SlowGate:
         self.latest: int | None = None
         self.history: list[tuple[int, Fraction, Fraction]] = []
 
-    def violated(self, now: int, command: int, torques: tuple[float, float]) -> set[Violation]:
+    def violated(self, now: int, command: int, torques: tuple[float, float]) -> set[Rejection]:
         """Returns all rules that these torques break."""
         plan = self.plan
         if self.latest is None:
@@ -215,13 +215,13 @@ class SlowGate:
         assert self.latest is not None
         broken = set()
         if now < self.latest:
-            broken.add(Violation.CLOCK)
+            broken.add(Rejection.CLOCK)
         if command > now:
-            broken.add(Violation.FUTURE)
+            broken.add(Rejection.FUTURE)
         if command < now - plan.stale_ns:
-            broken.add(Violation.STALE)
+            broken.add(Rejection.STALE)
         if not all(abs(torque) < INF for torque in torques):
-            return broken | {Violation.NOT_FINITE}
+            return broken | {Rejection.NOT_FINITE}
         exact = Fraction(torques[0]), Fraction(torques[1])
         for wheel, torque in enumerate(exact, 1):
             before = self.history[-1][wheel]
@@ -230,14 +230,14 @@ class SlowGate:
             if torque * before > 0:
                 rise, fall = abs(torque) - abs(before), abs(before) - abs(torque)
             if abs(torque) > plan.torque_limit:
-                broken.add(Violation.TORQUE)
+                broken.add(Rejection.TORQUE)
             if rise > plan.rise_limit:
-                broken.add(Violation.RISE)
+                broken.add(Rejection.RISE)
             if fall > plan.fall_limit:
-                broken.add(Violation.FALL)
+                broken.add(Rejection.FALL)
             window = [entry[wheel] for entry in self.history if now - entry[0] <= WINDOW]
             if max(*window, torque, torque) - min(*window, torque, torque) > plan.window_limit:
-                broken.add(Violation.WINDOW)
+                broken.add(Rejection.WINDOW)
         if not broken:
             self.latest = now
             self.history.append((now, *exact))
@@ -251,18 +251,18 @@ class SlowGate:
 
 def step(gate: Any, slow: SlowGate, now: int, age: int, torques: tuple[float, float]) -> bool:
     """Gives one command to both gates; returns True if it passed.  Asserts that they agree."""
-    before = Counter(gate.violations)
+    before = Counter(gate.rejections)
     broken = slow.violated(now, now - age, torques)
     right, left, reason = gate.check(now, now - age, *torques)
     if not broken:
         assert (right, left, reason) == (*torques, None)
-        assert gate.violations == before
+        assert gate.rejections == before
         return True
     slow.stop(now)
     assert (right, left) == (0.0, 0.0)
     assert reason in broken
     before[reason] += 1
-    assert gate.violations == before
+    assert gate.rejections == before
     return False
 
 

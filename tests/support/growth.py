@@ -1,7 +1,11 @@
-"""One robot alone, and how fast errors grow."""
+"""One robot alone, and how fast errors grow: in runs, and as predicted."""
 
 import numpy as np
 
+from echelon.controller.prediction.largest_delay import largest_extra_delay
+from echelon.controller.prediction.linear_run import LinearRun, later
+from echelon.controller.prediction.spectrum import spectral_radius
+from echelon.messages import Channel
 from echelon.plan.plan import Array, Plan
 from support.trees import plan_of, scenario
 
@@ -19,3 +23,13 @@ def growth(norms: Array) -> float:
     part = len(norms) // 8
     early, late = norms[4 * part : 5 * part].max(), norms[-part:].max()
     return float(np.log(late / early) / (len(norms) - 5 * part))
+
+
+def radius_of(plan: Plan, delay_ticks: int = 0, channel: Channel = Channel.STATE) -> float:
+    """Returns the predicted growth per period of the root, with all messages of a channel some of its periods later."""
+    return spectral_radius(LinearRun(later(plan, channel, delay_ticks * plan.root.period_ns)).map())
+
+
+def largest_delay_of(plan: Plan, channel: Channel = Channel.STATE) -> int | None:
+    """Returns how many ticks later all messages of a channel may be."""
+    return largest_extra_delay(plan, channel).ticks

@@ -16,7 +16,8 @@ from echelon.plan.plan import BlockPlan, Plan
 from echelon.runtime.link import LinkCounts
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.loading import load
-from echelon.sim.results.records import RunFacts
+from echelon.sim.results.records import ClaimResult, RunFacts
+from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
 
 PAPER = shipped.FOLDER / "paper.toml"
@@ -122,6 +123,11 @@ def run_facts(**given: Any) -> RunFacts:
     """Returns the facts of a run; `given` replaces some of them."""
     facts = RunFacts("inprocess", "virtual", 6.0, 0.0, 2.0, 200.0, 0, None)
     return replace(facts, **given)
+
+
+def claims_of(trace: Trace) -> tuple[ClaimResult, ...]:
+    """Returns the results of the claims of a run."""
+    return summarise(trace, (), None, run_facts()).claims
 
 
 def can_report(**given: Any) -> CanReport:

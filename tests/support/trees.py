@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.random import Generator
 
-from echelon.plan.layout import sized
+from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Plan
 from echelon.planning.plan_maker import make_plan
 from echelon.scenario.part_fields import PartContext
@@ -112,7 +112,7 @@ def with_random_gains(plan: Plan, random: Generator, coupling: float = 0.5) -> P
         k_bar[rows, rows] = 0.0
         k1, k2 = (np.array(near_unit(block.size, random)).reshape(block.size, block.size) for _ in range(2))
         blocks.append(replace(block, k1=k1, k2=k2))
-    return sized(replace(plan, blocks=tuple(blocks), coupling=k_bar))
+    return with_message_sizes(replace(plan, blocks=tuple(blocks), coupling=k_bar))
 
 
 def random_epsilon(tree: Tree, random: Generator, time_scales: str = "three") -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from echelon.agents.plant import state_at
 from echelon.agents.robot import Robot
 from echelon.messages import Channel, Message
-from echelon.plan.layout import sized
+from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, AvoidancePlan, Plan
 from echelon.sim.engines.in_process import Engine
 from support.trees import Tree, plan_of, random_epsilon, scenario, with_random_gains
@@ -29,7 +29,7 @@ def random_plan(
     law = random_epsilon(tree, random, time_scales) | {"lead": random.choice([0.0, 0.5])}
     law |= {"use": use, "parameters": LAWS[use]}
     plan = with_random_gains(plan_of(scenario(tree, random, law=law, **tables)), random, coupling)
-    return sized(replace(plan, avoidance=NEAR)) if avoidance else plan
+    return with_message_sizes(replace(plan, avoidance=NEAR)) if avoidance else plan
 
 
 class Watched:

@@ -1,5 +1,5 @@
-"""CiA 402 on a real SocketCAN interface against the package `canopen`, unmodified: as master of our drives, and as slaves
-of our host."""
+"""CiA 402 on a real SocketCAN interface with the unmodified package `canopen`, as master of our drives and as slaves of our
+host."""
 
 import logging
 import time
@@ -40,7 +40,7 @@ def network() -> Iterator[Any]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Waits for what another thread does; there is no event to wait for."""
+    """Waits for a condition that another thread fulfils without an event."""
     limit = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < limit
@@ -48,7 +48,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def bring_up(network: Any, node_id: int) -> Any:
-    """A master's node in OPERATION ENABLED, with SYNC, heartbeat and cyclic target torques on their way."""
+    """Returns a master's node in OPERATION ENABLED; SYNC, heartbeat and cyclic target torques are being sent."""
     node = network.add_node(canopen.BaseNode402(node_id, EDS))
     node.nmt.state = "PRE-OPERATIONAL"
     assert node.sdo["device name"].raw == "echelon virtual drive"
@@ -128,7 +128,7 @@ def test_a_lost_heartbeat_is_a_fault_that_the_master_resets(network: Any) -> Non
 
 
 class Slave:
-    """`canopen.LocalNode` with what it lacks of a drive: states by the package's own table, PDOs on SYNC."""
+    """`canopen.LocalNode` as a drive: adds states by the package's own table, and PDOs on SYNC."""
 
     def __init__(self, network: Any, node_id: int) -> None:
         self.node = network.add_node(canopen.LocalNode(node_id, EDS))

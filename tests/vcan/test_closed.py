@@ -97,7 +97,7 @@ def by_identifier(logged: Iterable[str]) -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_processes_on_the_bus_give_the_run_of_one_process(protocol: str, tmp_path: Path) -> None:
-    """Candump beside them hears every frame that is logged: the bridge's in their order, drives' by identifier."""
+    """Candump hears every frame in the log: the bridge's frames in their order, those of drives by identifier."""
     overrides = (*CLOSED, *PROTOCOLS[protocol])
     digest = in_one_process(LAB, overrides, tmp_path / "one")
     out = tmp_path / "candump.log"
@@ -124,7 +124,7 @@ def test_processes_on_the_bus_give_the_run_of_one_process(protocol: str, tmp_pat
 
 @pytest.fixture
 def interface() -> Iterator[str]:
-    """An interface that can go down without harm to others."""
+    """An interface of this test alone, which may go down."""
     ip("add", OWN, "type", "vcan")
     try:
         ip("set", OWN, "up")
@@ -146,7 +146,7 @@ def carried(interface: str) -> int:
 
 
 def await_torque(raw: socket.socket) -> None:
-    """Returns when a robot has been sent a torque."""
+    """Waits until a torque is sent to a robot."""
     codec = NativeCodec(0.001)
     limit_s = time.monotonic() + 60
     while time.monotonic() < limit_s:
@@ -158,7 +158,7 @@ def await_torque(raw: socket.socket) -> None:
 
 
 def down_for(seconds: float, run: subprocess.Popen[str], interface: str) -> None:
-    """Takes an interface down for some seconds while a run goes on; nothing is carried meanwhile."""
+    """Takes an interface down for some seconds during a run, and checks that it carries no frames meanwhile."""
     ip("set", interface, "down")
     before = carried(interface)
     with pytest.raises(subprocess.TimeoutExpired):

@@ -39,7 +39,7 @@ def bench() -> Iterator[Bench]:
 
 
 class Client:
-    """Commands a drive through the kernel's own interface."""
+    """Commands a drive through a plain socket of the kernel."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -67,7 +67,7 @@ class Client:
         return feedback
 
     def hold(self, right: float, left: float, wanted: Callable[[Feedback], bool], clear: bool = False) -> Feedback:
-        """Commands with every feedback until one is as wanted."""
+        """Sends the command after each feedback until one is `wanted`; returns that one."""
         for _ in range(500):
             feedback = self.heard()
             if wanted(feedback):

@@ -1,4 +1,4 @@
-"""Virtual ODrive axes and their host on a real interface, with the package odrive-can, unmodified, on the other side."""
+"""Virtual ODrive axes, and their host, on a real interface with the unmodified package odrive-can."""
 
 import asyncio
 import re
@@ -41,7 +41,7 @@ def socketcan() -> SocketcanBus:
 
 
 class Client:
-    """The package's driver of axis 2, and what it said of its encoder."""
+    """The package's driver of axis 2, with the encoder values that it reported."""
 
     def __init__(self) -> None:
         self.drive: Any = ODriveCAN(axis_id=2, can_bus=socketcan())
@@ -52,7 +52,7 @@ class Client:
         self.speed = message.data["Vel_Estimate"]
 
     async def push(self, torque: float, until: Callable[[], bool]) -> None:
-        """Commands a torque every 20 ms until something is so."""
+        """Commands a torque every 20 ms until a condition holds."""
         deadline_s = time.monotonic() + LIMIT_S
         while not until():
             assert time.monotonic() < deadline_s
@@ -60,8 +60,8 @@ class Client:
             await asyncio.sleep(0.02)
 
     async def ask(self, request: Callable[..., Awaitable[dict[str, Any]]], signal: str, *words: str) -> dict[str, Any]:
-        """Requests a message that has a signal.  If the cyclic one comes in between, a request has two answers: the package
-        then takes the second for the answer to the next request."""
+        """Requests until an answer has a signal.  If a cyclic message comes in between, a request has two answers, and the
+        package takes the second one for the answer to the next request."""
         for _ in range(5):
             answer = await request(*words)
             if signal in answer:
@@ -69,7 +69,7 @@ class Client:
         raise AssertionError(f"no {signal}")
 
     async def error(self) -> str:
-        """Waits, without sending anything, until the driver raises its error."""
+        """Waits without sending until the driver raises its error; returns its text."""
         deadline_s = time.monotonic() + LIMIT_S
         while time.monotonic() < deadline_s:
             try:
@@ -159,7 +159,7 @@ def test_odrive_can_sees_faults_and_emergency_stop(bench: Bench) -> None:
 
 
 def test_our_host_brings_up_the_packages_mock() -> None:
-    """The mock does not know torques; that it is told them, a listener decodes by the vendor's DBC."""
+    """The mock has no torques; a listener with the vendor's DBC checks that they are sent to it."""
     plan = drive_plan("odrive", (1, 2), period_ns=20 * MS, watchdog_ns=1000 * MS)  # its fastest report: 100 ms
     told: dict[str, Any] = {}
 

@@ -41,7 +41,7 @@ def test_a_stranger_who_speaks_for_a_robot_is_found(tmp_path: Path, capsys: pyte
         with open_bus(URL) as bus:
             while not end.wait(0.1):
                 bus.send(0x100, bytes(8))  # no valid CRC
-                bus.send(0x7E0, bytes(8))  # nobody's business
+                bus.send(0x7E0, bytes(8))  # an identifier that no robot uses
 
     stranger = threading.Thread(target=disturb)
     with LiveRobot(plan, URL) as robot:

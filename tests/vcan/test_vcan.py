@@ -1,4 +1,4 @@
-"""Frames on a real SocketCAN interface, seen by others than this project."""
+"""Frames on a real SocketCAN interface, received by foreign programs."""
 
 import re
 import socket
@@ -35,7 +35,7 @@ def bus() -> Iterator[Bus]:
 
 
 def listener(interface: str = "vcan0") -> socket.socket:
-    """A plain socket of the kernel's, with room for all frames of a test."""
+    """Returns a plain socket of the kernel with room for all frames of a test."""
     raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
     raw.bind((interface,))
@@ -85,7 +85,7 @@ def test_an_independent_socket_gets_every_frame(bus: Bus) -> None:
 
 
 def somebody_listens() -> bool:
-    """Whether a socket that takes all frames is bound to vcan0; the buses of this project filter."""
+    """Returns whether a socket without a filter is bound to vcan0; the buses of this project have filters."""
     return re.search(r"^ +vcan0 +0", Path("/proc/net/can/rcvlist_all").read_text(), re.MULTILINE) is not None
 
 
@@ -93,7 +93,7 @@ def test_candump_and_cantools_show_newton_metres(bus: Bus, tmp_path: Path) -> No
     dbc = tmp_path / "torque.dbc"
     dbc.write_text(lab_dbc(SCALE))
     total = STEPS * len(ROBOTS)
-    # as a user types it, but for its end: after all frames, or ten seconds of silence
+    # as a user types it, but it ends after all frames, or after ten seconds of silence
     with (
         subprocess.Popen(
             [*listen_command(bus.url).split(), "-n", str(total), "-T", "10000"], stdout=subprocess.PIPE
@@ -177,7 +177,7 @@ def test_a_receiver_holds_a_burst(bus: Bus) -> None:
         sent = run(bus)
         got = [receiver.recv(10.0) for _ in sent]
     assert [frame and (frame.can_id, frame.data) for frame in got] == sent
-    assert bus.recv(0.0) is None  # what it sent itself does not come back
+    assert bus.recv(0.0) is None  # a bus does not receive its own frames
 
 
 def test_the_way_to_the_bus_costs_no_more_than_twice_python_can() -> None:
@@ -214,7 +214,7 @@ def test_multicast_beside_it() -> None:
 
 
 def test_a_whole_run_as_processes_is_on_the_bus(tmp_path: Path) -> None:
-    """Thirteen members, recorder and bridge; candump beside them hears every torque, and cantools reads it in N m."""
+    """Candump hears every torque of thirteen members with recorder and bridge, and cantools decodes it in N m."""
     folder = tmp_path / "run"
     run_command = [sys.executable, "-m", "echelon", "run", "lab", "--set", "duration=1", "--set", "claims=[]"]
     run_command += ["--can", "socketcan:vcan0", "--no-report", "--quiet", "--out", str(folder)]

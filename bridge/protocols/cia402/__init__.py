@@ -32,13 +32,13 @@ class Cia402(DriveProtocol):
         return frozenset((NMT_ID, SYNC_ID, HEARTBEAT_ID + HOST_NODE))
 
     def refuses(self, motor: MotorPlan) -> str:
-        """Returns what is wrong with the rated torque, in thousandths of which torques are said."""
+        """Returns an error for a rated torque that object 6076 cannot hold; torques are thousandths of it."""
         if 1e-3 <= motor.rated_torque < 2**32 * 1e-3:
             return ""
         return f"rated_torque = {motor.rated_torque}: CiA 402 says it in 32 bits of 0.001 N m"
 
     def host(self, drive: DrivePlan) -> Host:
-        """Returns what commands a robot's drives."""
+        """Returns the host of a robot's drives."""
         from echelon.bridge.protocols.cia402.host import Cia402Host
 
         return Cia402Host(drive)
@@ -50,13 +50,13 @@ class Cia402(DriveProtocol):
         return Cia402Drive(drive, number)
 
     def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
-        """Returns what listens to a robot's frames."""
+        """Returns the observer of a robot's frames."""
         from echelon.bridge.protocols.cia402.observe import Cia402Observer
 
         return Cia402Observer(drive, envelope)
 
     def master(self, period_ns: int, watchdog_ns: int) -> "Master":
-        """Returns what sends SYNC and the host's heartbeat."""
+        """Returns the master, which sends SYNC and the host's heartbeat."""
         from echelon.bridge.protocols.cia402.host import Master
 
         return Master(period_ns, watchdog_ns)
@@ -85,7 +85,7 @@ class Cia402(DriveProtocol):
         return max(1, round(1000 * drive.motor.rated_torque)) * 1e-6
 
     def boot_ups(self, drive: DrivePlan) -> Mapping[tuple[int, bytes], frozenset[int]]:
-        """Returns a node's reports and heartbeats, which begin anew with its boot-up message."""
+        """Returns the boot-up messages of both nodes, with the identifiers of their reports and heartbeats."""
         from echelon.bridge.protocols.cia402.codec import HEARTBEAT_ID, TPDO_IDS, Nmt
 
         boot_up = bytes((Nmt.BOOT_UP,))

@@ -1,20 +1,20 @@
-"""CANopen frames, and the words and states of a CiA 402 drive.  Little endian; identifiers of the predefined set:
+"""CANopen frames, and the control- and statusword of a CiA 402 drive.  Little endian; identifiers of the predefined set:
 
     0x000        NMT command: u8 command, u8 node (0: all)
     0x080        SYNC: no data
     0x080 + node EMCY: u16 error code, u8 error register, 5 bytes of the maker's (here zero)
-    0x180, 0x280, 0x380, 0x480 + node   TPDO1 .. 4, what a drive reports
-    0x200, 0x300, 0x400, 0x500 + node   RPDO1 .. 4, what a drive is told
+    0x180, 0x280, 0x380, 0x480 + node   TPDO1 .. 4, from the drive
+    0x200, 0x300, 0x400, 0x500 + node   RPDO1 .. 4, to the drive
     0x580 + node SDO answer; 0x600 + node SDO request, 8 bytes each (bridge.protocols.cia402.sdo)
     0x700 + node heartbeat: u8 NMT state; with state 0 the boot-up message
 
-What host and drives here put into the PDOs:
+The host maps the PDOs in this way:
 
-    RPDO1  u16 controlword, i8 mode of operation          when it changes
-    RPDO2  i16 target torque [‰ of the rated torque]      once per period, acts when it arrives
+    RPDO1  u16 controlword, i8 mode of operation          sent when it changes
+    RPDO2  i16 target torque [‰ of the rated torque]      sent once per period, acts when it arrives
     TPDO1  u16 statusword, i8 mode of operation           on SYNC
-    TPDO2  i32 position [counts], i16 torque [‰], the mean since the last SYNC
-    TPDO3  i32 velocity [counts/s]
+    TPDO2  i32 position [counts], i16 torque [‰]          on SYNC; the torque is the mean since the last SYNC
+    TPDO3  i32 velocity [counts/s]                        on SYNC
 """
 
 import math
@@ -34,10 +34,10 @@ SDO_ANSWER_ID = 0x580
 SDO_REQUEST_ID = 0x600
 HEARTBEAT_ID = 0x700
 NODE_IDS = (EMCY_ID, *TPDO_IDS, *RPDO_IDS, SDO_ANSWER_ID, SDO_REQUEST_ID, HEARTBEAT_ID)
-"""What identifiers of a node begin with."""
+"""The bases of a node's identifiers, to which its node id is added."""
 MAX_NODE = 126
 HOST_NODE = 127
-"""The node that the host's heartbeat is of; the drives' nodes are 1 .. 126."""
+"""Node id of the host's heartbeat; drives have 1 .. 126."""
 PERMILLE_MAX = 32767
 
 MODE_NONE = 0
@@ -53,7 +53,7 @@ EMCY = struct.Struct("<HB5x")
 
 
 class Nmt(IntEnum):
-    """What a node may do: the state byte of its heartbeat."""
+    """NMT state of a node, as in the byte of its heartbeat (bridge.protocols.cia402.node)."""
 
     BOOT_UP = 0
     STOPPED = 4
@@ -62,7 +62,7 @@ class Nmt(IntEnum):
 
 
 class NmtCommand(IntEnum):
-    """What the host tells a node to be."""
+    """NMT command of the host."""
 
     START = 1
     STOP = 2
@@ -72,7 +72,7 @@ class NmtCommand(IntEnum):
 
 
 class State(Enum):
-    """States of the drive: the statusword's bits that tell them, and under which mask."""
+    """States of the drive (bridge.protocols.cia402.drive): their bits in the statusword, and the mask of these bits."""
 
     NOT_READY_TO_SWITCH_ON = (0x00, 0x4F)
     SWITCH_ON_DISABLED = (0x40, 0x4F)
@@ -85,12 +85,12 @@ class State(Enum):
 
     @property
     def bits(self) -> int:
-        """The statusword of a drive in this state, but for bits that tell something else."""
+        """The bits of this state in the statusword."""
         return self.value[0]
 
     @property
     def words(self) -> str:
-        """Its name as the standard has it."""
+        """The standard's name of the state."""
         return self.name.replace("_", " ")
 
 
@@ -103,18 +103,18 @@ FOLLOWS_COMMAND = 1 << 12
 
 
 def state_of(statusword: int) -> State | None:
-    """The state a statusword tells; None for bits that tell none."""
+    """Returns the state in a statusword; None if its bits stand for no state."""
     return _STATES[statusword & 0x7F]
 
 
 class Command(Enum):
-    """What a controlword asks for: a controlword that does."""
+    """Commands in a controlword; the value is a controlword with this command."""
 
     DISABLE_VOLTAGE = 0x00
     QUICK_STOP = 0x02
     SHUTDOWN = 0x06
     SWITCH_ON = 0x07
-    """Also: disable operation"""
+    """From OPERATION ENABLED this is the command disable operation"""
     ENABLE_OPERATION = 0x0F
     FAULT_RESET = 0x80
 
@@ -124,7 +124,7 @@ HALT = 1 << 8
 
 
 def command_of(controlword: int, last: int) -> Command:
-    """What a controlword asks for after the one before it; a fault reset is a rising edge."""
+    """Returns the command in a controlword; `last` is the one before it, since a fault reset is a rising edge."""
     if controlword & ~last & _FAULT_RESET_BIT:
         return Command.FAULT_RESET
     if not controlword & 2:
@@ -154,11 +154,13 @@ TRANSITIONS = {
     (State.FAULT, Command.FAULT_RESET): State.SWITCH_ON_DISABLED,  # 15
     (State.QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION): State.OPERATION_ENABLED,  # 16
 }
-"""Where a command leads; in a state that is not here with it, it changes nothing."""
+"""The next state by state and command, with the standard's number of the transition.  Other commands change nothing."""
 
 
 def next_state(state: State, controlword: int, last: int) -> State:
-    """Where a controlword leads after the one before it.  Where there is no fault to reset, its other bits count."""
+    """Returns the state after a controlword; `last` is the one before it.
+
+    Outside FAULT, the bit fault reset is ignored and the other bits count."""
     command = command_of(controlword, last)
     if command is Command.FAULT_RESET and state is not State.FAULT:
         command = command_of(controlword & ~_FAULT_RESET_BIT, 0)
@@ -170,7 +172,7 @@ AUTOMATIC = {
     State.QUICK_STOP_ACTIVE: State.SWITCH_ON_DISABLED,  # 12
     State.FAULT_REACTION_ACTIVE: State.FAULT,  # 14
 }
-"""Where a state may lead by itself, besides transition 13: from any state to FAULT REACTION ACTIVE."""
+"""Transitions without a command, except 13, which leads from any state to FAULT REACTION ACTIVE."""
 
 
 class ErrorCode(IntEnum):
@@ -185,7 +187,7 @@ class ErrorCode(IntEnum):
 
     @property
     def register(self) -> int:
-        """Its bits in the error register, object 1001: bit 0 always, one for the kind."""
+        """The bits of this error in the error register, object 1001: bit 0, and a bit for its kind."""
         return _REGISTERS[self]
 
 
@@ -205,7 +207,7 @@ FAULT_CODES = {
 
 
 def error_text(code: int) -> str:
-    """An error code in words, as far as known here."""
+    """Returns an error code as a number, with its name if it is one of `ErrorCode`."""
     try:
         return f"0x{code:04X} {ErrorCode(code).name.lower().replace('_', ' ')}"
     except ValueError:
@@ -213,7 +215,7 @@ def error_text(code: int) -> str:
 
 
 class Emergency(NamedTuple):
-    """What an emergency message says."""
+    """The content of an emergency message."""
 
     code: int
     register: int
@@ -227,17 +229,17 @@ def check_node(node: int) -> int:
 
 
 def nmt(command: NmtCommand, node: int) -> Frame:
-    """The frame that commands a node, or all with 0."""
+    """Returns the frame with an NMT command for a node; node 0 means all."""
     return Frame(NMT_ID, bytes((command, node)))
 
 
 def heartbeat(node: int, state: Nmt) -> Frame:
-    """A node's heartbeat."""
+    """Returns a node's heartbeat."""
     return Frame(HEARTBEAT_ID + node, bytes((state,)))
 
 
 def heartbeat_state(data: bytes) -> Nmt | None:
-    """The state in a heartbeat; None if it is none."""
+    """Returns the NMT state in the data of a heartbeat; None if they are invalid."""
     try:
         return Nmt(data[0]) if len(data) == 1 else None
     except ValueError:
@@ -245,32 +247,34 @@ def heartbeat_state(data: bytes) -> Nmt | None:
 
 
 def emergency(node: int, code: int, register: int) -> Frame:
-    """A node's emergency message."""
+    """Returns a node's emergency message."""
     return Frame(EMCY_ID + node, EMCY.pack(code, register))
 
 
 def emergency_of(data: bytes) -> Emergency | None:
-    """What an emergency message says; None if it has the wrong length."""
+    """Returns the content of an emergency message; None if it has the wrong length."""
     return Emergency(*EMCY.unpack(data)) if len(data) == EMCY.size else None
 
 
 def rated_mnm(rated_torque: float) -> int:
-    """Object 6076, the rated torque [mN m], of one in N m.  Raises ValueError if it is not 1 mN m .. 4 MN m."""
+    """Returns object 6076, the rated torque [mN m], for `rated_torque` [N m].
+
+    Raises ValueError if it is not within 0.001 .. 4294967 N m."""
     if not (math.isfinite(rated_torque) and 1 <= round(rated_torque * 1000) < 1 << 32):
         raise ValueError(f"rated torque must be 0.001 N m .. 4294967 N m, not {rated_torque!r}")
     return round(rated_torque * 1000)
 
 
 def permille(torque: float, rated: int) -> int:
-    """A torque [N m] in thousandths of the rated torque [mN m], to the nearest, cut to what an i16 holds both ways."""
+    """Returns a torque [N m] in thousandths of the rated torque [mN m], rounded, and cut to the range of an i16."""
     return max(-PERMILLE_MAX, min(PERMILLE_MAX, round(torque * 1e6 / rated)))
 
 
 def newton_metres(value: int, rated: int) -> float:
-    """A torque [N m] from thousandths of the rated torque [mN m]."""
+    """Returns a torque [N m], given in thousandths of the rated torque [mN m]."""
     return value * rated * 1e-6
 
 
 def milliseconds(duration_ns: int) -> int:
-    """A time for a u16 object [ms], not more than the given one, but at least 1."""
+    """Returns a time in ms for a u16 object, rounded down, but at least 1."""
     return max(1, min(0xFFFF, duration_ns // 1_000_000))

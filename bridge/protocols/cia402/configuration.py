@@ -1,4 +1,4 @@
-"""What a host writes to a drive before it enables it, object by object."""
+"""The objects that a host writes to a drive before it enables it."""
 
 from typing import NamedTuple
 
@@ -16,12 +16,12 @@ from echelon.plan.can_plan import DrivePlan
 
 
 def heartbeat_ns(period_ns: int, watchdog_ns: int) -> int:
-    """Returns the period of heartbeats: at most two fifths of the watchdog's, in whole periods, one at least."""
+    """Returns the period of heartbeats [ns]: at most two fifths of the watchdog, in whole periods, but at least one period."""
     return max(1, watchdog_ns * 2 // 5 // period_ns) * period_ns
 
 
 class Step(NamedTuple):
-    """An object to write; to read and compare, if `read`."""
+    """An object to write with `data`, or, if `read`, to read and compare with `data`."""
 
     key: Key
     data: bytes
@@ -46,11 +46,11 @@ def _pdo_steps(
 
 
 def steps(plan: DrivePlan, node: int) -> list[Step]:
-    """What makes a drive of one that was just switched on, whatever it had before."""
+    """Returns the steps that configure a drive, whatever its configuration was before."""
     watchdog = milliseconds(plan.watchdog_ns)
     beat_ns = heartbeat_ns(plan.period_ns, plan.watchdog_ns)
     beat = milliseconds(beat_ns)
-    # a host that is gone is noticed by its torques first
+    # longer than the watchdog, so that a lost host shows first by its missing torques
     host = milliseconds(plan.watchdog_ns + beat_ns)
     steps = [
         Step(objects.RATED_TORQUE, rated_mnm(plan.motor.rated_torque).to_bytes(4, "little"), read=True),

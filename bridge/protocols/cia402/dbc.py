@@ -1,4 +1,4 @@
-"""The CANopen frames of a robot's drives for `echelon dbc`, with the PDOs as its host maps them.  Pure."""
+"""DBC messages of a robot's CANopen frames, with the PDOs as the host maps them.  Pure."""
 
 import re
 from math import ceil
@@ -36,7 +36,7 @@ from echelon.bridge.protocols.frame import WHEELS
 from echelon.plan.can_plan import DrivePlan
 
 DRIVES = "drives"
-"""Who hears what is for all drives on a bus."""
+"""The DBC node that receives frames for all drives of a bus."""
 CONTROLWORD_BITS = {
     0: "switch_on",
     1: "enable_voltage",
@@ -66,7 +66,7 @@ _COMMANDS = (*RPDO_IDS, SDO_REQUEST_ID)
 def messages(plan: DrivePlan, robot_name: str) -> list[Message]:
     """Returns the messages of both drives.
 
-    They are called <robot>_<wheel>_<kind>, and the sender of reports drive_<robot>_<wheel>."""
+    A message is named <robot>_<wheel>_<kind>; the sender of reports is drive_<robot>_<wheel>."""
     robot = re.sub(r"\W", "_", robot_name, flags=re.ASCII)
     period_ns, beat_ns = plan.period_ns, heartbeat_ns(plan.period_ns, plan.watchdog_ns)
     torque, turn = rated_mnm(plan.motor.rated_torque) * 1e-6, 1 / plan.motor.encoder_counts
@@ -106,7 +106,7 @@ def messages(plan: DrivePlan, robot_name: str) -> list[Message]:
 
 
 def shared_messages(period_ns: int, watchdog_ns: int) -> list[Message]:
-    """Returns what the host sends for all drives on a bus."""
+    """Returns the messages that the host sends to all drives of a bus."""
     command = number("command", 0, 8, DRIVES, signed=False, choices=names(NmtCommand))
     node = number("node", 8, 8, DRIVES, signed=False, choices={0: "all"})
     beat = number("state", 0, 8, DRIVES, signed=False, choices=names(Nmt))
@@ -119,6 +119,6 @@ def shared_messages(period_ns: int, watchdog_ns: int) -> list[Message]:
 
 
 def _sdo(receiver: str) -> list[Signal]:
-    """Returns the bytes of an SDO as all but segments have them."""
+    """Returns the fields of an SDO message; segments have other ones."""
     fields = (("command", 0, 8), ("index", 8, 16), ("subindex", 24, 8), ("data", 32, 32))
     return [number(name, start, bits, receiver, signed=False) for name, start, bits in fields]

@@ -1,14 +1,26 @@
-"""A virtual CiA 402 drive: one CANopen node that gives one wheel its torque, in mode 4 (profile) or 10 (cyclic).
+"""A virtual CiA 402 drive: one CANopen node with the motor of one wheel, in mode 4 (profile torque) or 10 (cyclic torque).
 
-- The target torque, 6071, begins at zero whenever operation is enabled: nothing old moves the wheel.  6072 limits it.
-- What the standard calls ramps, of quick stop and of a fault's reaction, is immediate: the power stage is switched off.
-- Watchdog: while operation is enabled, the RPDO that carries 6071 (RPDO2 if none does) must come within its event timer,
-  which at first is the plan's watchdog; else a fault.  Writing 6071 by SDO does as well.  Other RPDOs with an event timer
-  are watched from the first that came.
-- After a fault, the first torque that is taken is zero.
-- Without the host's heartbeat it does by 6007: 0 nothing, 1 fault, 2 and 3 no power.  Such a fault cannot be reset before
-  the host is heard again.
-- A node that leaves NMT OPERATIONAL has no power.
+state                     entered when                                        what the drive does
+NOT READY TO SWITCH ON    at power-on or NMT reset                            boots, then SWITCH ON DISABLED
+SWITCH ON DISABLED        after boot-up; disable voltage (00); quick stop     no power
+                          from a lower state; a fault reset; OPERATION
+                          ENABLED when NMT OPERATIONAL is left
+READY TO SWITCH ON        shutdown (controlword 06)                           no power
+SWITCHED ON               switch on (07)                                      no power
+OPERATION ENABLED         enable operation (0F)                               follows the target torque, which starts at zero
+QUICK STOP ACTIVE         quick stop (02) from OPERATION ENABLED              no power; stays with option codes 5 and 6 of
+                                                                              605A, else goes on to SWITCH ON DISABLED
+FAULT                     any fault, from any state, through FAULT            no power; a fault reset (80) leads to SWITCH ON
+                          REACTION ACTIVE, which takes no time                DISABLED if the cause is gone
+
+- Object 6071 is the target torque; 6072 limits it.  Ramps of a quick stop or of a fault reaction do not exist: the power stage
+  is switched off at once.
+- Watchdog: in OPERATION ENABLED, the RPDO that carries 6071 (RPDO2 if none does) must come within its event timer, otherwise
+  there is a fault.  The event timer starts as the plan's watchdog.  Writing 6071 by SDO also feeds it.  Other RPDOs
+  with an event timer are watched from their first frame on.
+- After a fault, the drive refuses torques until the first zero.
+- If the host's heartbeat is lost, object 6007 decides: 0 nothing, 1 a fault, 2 and 3 no power.  Such a fault cannot be reset
+  before the host's heartbeat comes again.
 """
 
 from typing import Final
@@ -46,7 +58,7 @@ from echelon.plan.can_plan import NEVER_NS, DrivePlan
 
 MODES: Final = (MODE_NONE, MODE_PROFILE_TORQUE, MODE_CYCLIC_TORQUE)
 _STAYS = (5, 6)
-"""Quick stop option codes with which QUICK STOP ACTIVE lasts."""
+"""Quick stop option codes with which the drive stays in QUICK STOP ACTIVE."""
 
 
 class Cia402Drive(Node):
@@ -64,7 +76,7 @@ class Cia402Drive(Node):
         self._rated = rated_mnm(motor.rated_torque)
         self._silent = False
         self._hold = False
-        """There was a fault, and no zero torque since it was reset."""
+        """True from a fault until the first zero torque after it."""
         self._errors: list[ErrorCode] = []
         self._controlword = 0
         self._limited = False
@@ -88,18 +100,18 @@ class Cia402Drive(Node):
             objects.VELOCITY: lambda: round(motor.velocity * motor.plan.encoder_counts),
             objects.TORQUE_DEMAND: lambda: permille(motor.setpoint, self._rated),
             objects.TORQUE_ACTUAL: lambda: permille(motor.torque, self._rated),
-            # the same thousandths of the rated current, since torque is proportional to current
+            # current is proportional to torque, so it has the same value in thousandths of the rated current
             objects.CURRENT_ACTUAL: lambda: permille(motor.torque, self._rated),
             objects.DC_LINK_VOLTAGE: lambda: round(motor.bus_voltage * 1000),
             objects.TEMPERATURE: lambda: round(motor.temperature * 10),
         }
 
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
-        """Takes a frame; returns what it answers at once."""
+        """Takes a frame; returns the immediate answers."""
         return self.advance(time_ns) if self._silent else super().receive(time_ns, frame)
 
     def inject(self, time_ns: int, wheel: int, fault: Fault) -> list[Frame]:
-        """Makes a fault happen at its wheel.  Raises ValueError for another wheel, or a fault that comes of the bus."""
+        """Makes a fault happen at its wheel.  Raises ValueError for another wheel, or a fault that only the bus can cause."""
         self._check(wheel, fault)
         out = self.advance(time_ns)
         if fault is Fault.SILENT:
@@ -113,9 +125,9 @@ class Cia402Drive(Node):
         return out + self.advance(time_ns)
 
     def mend(self, time_ns: int, wheel: int, fault: Fault) -> None:
-        """Takes the cause of a fault away; what it latched stays latched until it is reset over the bus."""
+        """Takes the cause of a fault away.  A latched fault stays until it is reset over the bus."""
         self._check(wheel, fault)
-        self._pass(time_ns)  # what is due before is sent with the next call
+        self._pass(time_ns)  # the next call returns frames that are due before
         if fault is not Fault.SILENT:
             self.motor.mend(time_ns, fault)
         elif self._silent:
@@ -128,7 +140,7 @@ class Cia402Drive(Node):
         if fault not in ON_DEMAND:
             raise ValueError(f"faults on demand are {', '.join(ON_DEMAND)}, not {fault!r}")
 
-    # what a node asks of it
+    # the profile of a node (profile.py)
 
     def _switch_on(self, time_ns: int) -> None:
         self._power_off(time_ns)
@@ -141,7 +153,7 @@ class Cia402Drive(Node):
     def _booted(self, time_ns: int) -> None:
         if self.state is State.NOT_READY_TO_SWITCH_ON:
             self.state = AUTOMATIC[self.state]
-        # what was there before has latched nothing yet
+        # causes from before the boot-up latch now
         for fault in sorted(self.motor.causes):
             self._fail(time_ns, FAULT_CODES[fault])
 
@@ -187,7 +199,7 @@ class Cia402Drive(Node):
     def _rest(self, time_ns: int) -> None:
         if self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
             self._go(time_ns, State.SWITCH_ON_DISABLED)
-        self.motor.mean_torque(time_ns)  # what comes next is another mean
+        self.motor.mean_torque(time_ns)  # the next report is a mean from here on
 
     def _without_host(self, time_ns: int) -> None:
         option = self._od[objects.ABORT_CONNECTION]
@@ -227,7 +239,7 @@ class Cia402Drive(Node):
             self._power_off(time_ns)
 
     def _fail(self, time_ns: int, code: ErrorCode) -> None:
-        """Goes through FAULT REACTION ACTIVE, which takes no time, to FAULT."""
+        """Enters FAULT, through FAULT REACTION ACTIVE, which takes no time."""
         self.state = AUTOMATIC[State.FAULT_REACTION_ACTIVE]
         self._hold = True
         self._power_off(time_ns)
@@ -243,14 +255,14 @@ class Cia402Drive(Node):
         self._drop_due("rpdo")
 
     def _feed(self, time_ns: int) -> None:
-        """The watchdog of the target torque begins anew."""
+        """Restarts the watchdog of the target torque."""
         carriers = [pdo.number for pdo in self._rpdos.values() if objects.TARGET_TORQUE in pdo.keys] or [1]
         for number in carriers:
             timer = self._od[objects.RPDO_COMMUNICATION + number, objects.EVENT_TIMER]
             self._set_due("rpdo", number, time_ns, timer * 1_000_000)
 
     def _apply(self, time_ns: int) -> None:
-        """Lets the motor follow the target torque, if there is anything it may follow."""
+        """Sets the motor's torque from the target torque, in OPERATION ENABLED."""
         if self.state is not State.OPERATION_ENABLED:
             return
         od = self._od

@@ -1,10 +1,10 @@
-"""The electronic data sheet (CiA 306) of the drive, from its object dictionary.  drive.eds beside it is this text."""
+"""The electronic data sheet (CiA 306) of the drive, made from its object dictionary.  The file drive.eds holds this text."""
 
 from echelon.bridge.protocols.cia402.objects import INDICES, NAMES, OBJECTS, Object
 
 
 def eds() -> str:
-    """The electronic data sheet: the object dictionary as tools read it (CiA 306)."""
+    """Returns the electronic data sheet as text."""
     groups = {"Mandatory": (0x1000, 0x1001, 0x1018), "Manufacturer": range(0x2000, 0x6000)}
     listed: dict[str, list[int]] = {"Mandatory": [], "Optional": [], "Manufacturer": []}
     for index in sorted(INDICES):

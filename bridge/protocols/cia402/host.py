@@ -1,6 +1,6 @@
-"""The host of a robot's two CiA 402 drives, and what a CANopen bus has one of: the master's heartbeat and SYNC.
+"""The host of a robot's two CiA 402 drives, and the master of a CANopen bus: the host's heartbeat and SYNC.
 
-Each drive is brought up by itself, one SDO request per `poll` (bridge.protocols.cia402.wheel).
+Each drive is brought up separately, with one SDO request per `poll` (bridge.protocols.cia402.wheel).
 """
 
 import math
@@ -24,7 +24,7 @@ from echelon.plan.can_plan import DrivePlan
 
 
 class Master:
-    """What goes out once per bus, whatever the number of robots; the smallest watchdog of them counts."""
+    """SYNC and the host's heartbeat, once per bus.  Raises ValueError for a period or a watchdog that is not positive."""
 
     def __init__(self, period_ns: int, watchdog_ns: int) -> None:
         if period_ns <= 0 or watchdog_ns <= 0:
@@ -34,20 +34,20 @@ class Master:
         self._next_ns: int | None = None
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns the host's heartbeat when it is due; to be called once per period, early or late by less than half of it."""
+        """Returns the host's heartbeat if it is due; must be called once per period, early or late by less than half."""
         due_ns = time_ns if self._next_ns is None else self._next_ns
         if time_ns < due_ns - self._slack_ns:
             return []
-        self._next_ns = max(due_ns, time_ns - self._slack_ns) + self._every_ns  # after a standstill from now on
+        self._next_ns = max(due_ns, time_ns - self._slack_ns) + self._every_ns  # no burst after a standstill
         return [heartbeat(HOST_NODE, Nmt.OPERATIONAL)]
 
     def sync(self) -> Frame:
-        """Returns the SYNC; at its end the drives sample what they report."""
+        """Returns the SYNC, at whose end the drives sample their feedback."""
         return Frame(SYNC_ID)
 
 
 class Cia402Host:
-    """Commands both drives of a robot.  Raises ValueError for bad node ids, or twice the same."""
+    """Commands both drives of a robot.  Raises ValueError for an invalid node id, or the same for both wheels."""
 
     def __init__(self, plan: DrivePlan) -> None:
         if plan.node_ids[0] == plan.node_ids[1]:
@@ -60,44 +60,46 @@ class Cia402Host:
         self._listeners = {base + wheel.node: (wheel, base) for wheel in self._wheels for base in bases}
         self._identifiers = frozenset(self._listeners)
         self._started = True
-        self._ready = False  # a zero torque was sent since both are enabled
+        self._ready = False  # the first zero torque was sent since both drives are enabled
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers of the frames that it listens to."""
         return self._identifiers
 
     @property
     def torque(self) -> tuple[float, float]:
-        """Torque of the right and left wheel as the drives last reported it, means between two SYNCs [N m]."""
+        """The last reported torques of the right and the left wheel, means between two SYNCs [N m]."""
         right, left = self._wheels
         return right.torque, left.torque
 
     @property
     def torque_ns(self) -> int | None:
-        """When the older of the two came; None before both did."""
+        """When the older of the two reports came [ns]; None before both have come."""
         right, left = (wheel.torque_ns for wheel in self._wheels)
         return None if right is None or left is None else min(right, left)
 
     @property
     def enabled(self) -> bool:
-        """True while both wheels take torque, as far as their drives said."""
+        """True while both wheels take torque, by what their drives reported."""
         right, left = self._wheels
         return self._started and right.enabled and left.enabled
 
     @property
     def fault(self) -> str:
-        """What a drive reports to be wrong, in words; empty if nothing is."""
+        """The present faults of the drives in words; empty without any."""
         return "; ".join(
             f"{name}: {wheel.fault}" for name, wheel in zip(WHEELS, self._wheels, strict=True) if wheel.fault
         )
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns what is due besides torques: to bring drives up, or clear a fault and enable anew."""
+        """Returns all due frames except torques: they bring drives up, clear faults and enable again."""
         return [frame for wheel in self._wheels for frame in wheel.poll(time_ns, self._started)]
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
-        """Returns the frames for wheel torques [N m], finite ones; zeros are sent while a drive is not enabled."""
+        """Returns the frames for wheel torques [N m].  It sends zeros until both drives are enabled.
+
+        Raises ValueError for a torque that is not finite."""
         if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
             raise ValueError(f"torques must be finite, not {tau_right!r} and {tau_left!r}")
         enabled = self.enabled
@@ -110,11 +112,11 @@ class Cia402Host:
         ]
 
     def stop(self, time_ns: int) -> list[Frame]:
-        """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
+        """Returns frames that take the torque away at once and disable the drives.  They stay disabled until `start`."""
         return self._halt(time_ns, Command.DISABLE_VOLTAGE)
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns frames that make the drives stop quickly, as they are configured to; they stay so until `start`."""
+        """Returns the quick stop: the drives take the torque away themselves.  They stay stopped until `start`."""
         return self._halt(time_ns, Command.QUICK_STOP)
 
     def _halt(self, time_ns: int, command: Command) -> list[Frame]:
@@ -127,13 +129,13 @@ class Cia402Host:
         ]
 
     def start(self) -> None:
-        """Lets `poll` enable the drives (again), whatever was wrong until then.  A new host is started."""
+        """Lets `poll` enable the drives (again), whatever was wrong before.  A new host is started already."""
         self._started = True
         for wheel in self._wheels:
             wheel.recover()
 
     def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
-        """Returns the target torques [N m], finite ones, whatever the drives say."""
+        """Returns the frames for finite wheel torques [N m], whatever the drives reported."""
         torques = (tau_right, tau_left) if enable else (0.0, 0.0)
         return [wheel.target(torque) for wheel, torque in zip(self._wheels, torques, strict=True)]
 

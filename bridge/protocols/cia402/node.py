@@ -1,8 +1,16 @@
-"""A CANopen node: network management, SDO, PDOs, heartbeats and errors, with a device profile in a class on top of it.
+"""A CANopen node: network management (NMT), SDO, PDOs, heartbeats and errors.  A device profile is a class derived from it.
 
-- Heartbeat of the host (`1016`): watched from the first one on.  What happens when it is lost is the profile's matter,
-  and that of `1029` for the NMT state: to begin with it stays, so that the host sees what happened.
-- Whatever comes is checked; what is refused is counted by reason.
+NMT state          entered when                               what the node does
+BOOT UP            at power-on; NMT reset node; NMT reset     sends its boot-up message, then PRE-OPERATIONAL
+                   communication
+PRE-OPERATIONAL    after boot-up; NMT command                 SDO, heartbeat, emergency messages
+OPERATIONAL        NMT start                                  also PDOs
+STOPPED            NMT stop                                   heartbeat only
+
+The host's heartbeat (object 1016) is watched from the first one on.  If it is lost, the profile reacts, and object 1029 decides
+about the NMT state.  By default the NMT state stays, so that the host can see the reason.
+
+Frames that are refused are counted by reason.
 """
 
 from collections import Counter
@@ -33,11 +41,11 @@ from echelon.plan.can_plan import NEVER_NS
 
 MS = 1_000_000
 _STATES = (objects.STATUSWORD, objects.MODE_DISPLAY, objects.ERROR_CODE, objects.ERROR_REGISTER)
-"""A change of these sends a TPDO that goes by itself."""
+"""Objects whose change triggers a TPDO of type 254 or 255."""
 
 
 class Node(Profile):
-    """A node with this id; `values` are those of objects that have no default."""
+    """A node with the id `node`; `values` are those of objects without a default."""
 
     def __init__(self, node: int, values: Mapping[Key, int]) -> None:
         self.node = node
@@ -48,13 +56,14 @@ class Node(Profile):
         self._now_ns = 0
         self._begun = False
         self._due: dict[tuple[str, int], int] = {}
-        """What happens when: boot, heartbeat, host (its heartbeat is lost), tpdo, rpdo (it did not come)."""
+        """Times [ns] of coming events by kind and number: boot, heartbeat, host (its heartbeat is lost), tpdo (its event timer
+        or inhibit time is over), rpdo (it did not come in time)."""
         self._out: list[Frame] = []
         self._waiting: dict[int, list[int]] = {}
         """Values of RPDOs that wait for SYNC."""
         self._syncs = 0
         self._sent: dict[int, tuple[int, list[int]]] = {}
-        """When TPDOs were last sent, and what it was that makes them go by themselves."""
+        """For each TPDO: when it was last sent, and the values then whose change triggers it."""
         self._host_lost = False
         self._configure()
 
@@ -62,16 +71,16 @@ class Node(Profile):
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers of the frames that it listens to."""
         return self._identifiers
 
     @property
     def due_ns(self) -> int:
-        """When it next has something to do on its own."""
+        """When `advance` must be called next."""
         return min(self._due.values(), default=NEVER_NS) if self._begun else -NEVER_NS
 
     def advance(self, time_ns: int) -> list[Frame]:
-        """Lets time pass; returns what it sends on its own until then, what is due at `time_ns` included."""
+        """Lets time pass; returns the frames that the node sends by itself up to and including `time_ns`."""
         self._pass(time_ns)
         out, self._out = self._out, []
         return out
@@ -94,7 +103,7 @@ class Node(Profile):
             self._send_changed(time_ns)
 
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
-        """Takes a frame; returns what it answers at once."""
+        """Takes a frame; returns the immediate answers."""
         out = self.advance(time_ns)
         self._now_ns = time_ns
         can_id, data, remote = frame
@@ -134,7 +143,7 @@ class Node(Profile):
                 self._send(time_ns, self._tpdos[number])
 
     def _set_due(self, what: str, number: int, time_ns: int, after_ns: int) -> None:
-        """Something is due after a while; never, if that is 0."""
+        """Schedules an event `after_ns` after `time_ns`; 0 cancels it."""
         if after_ns:
             self._due[what, number] = time_ns + after_ns
         else:
@@ -189,7 +198,7 @@ class Node(Profile):
                 self.refused["NMT command"] += 1
 
     def _leave(self, time_ns: int, nmt: Nmt) -> None:
-        """Leaves the NMT state for one in which there are no PDOs."""
+        """Changes the NMT state to one without PDOs."""
         if nmt is not self.nmt:
             self.nmt = nmt
             self._waiting.clear()
@@ -211,7 +220,7 @@ class Node(Profile):
             self._leave(time_ns, Nmt.PRE_OPERATIONAL if behaviour == 0 else Nmt.STOPPED)
 
     def _report(self, errors: list[ErrorCode]) -> None:
-        """Sends an emergency message for the last of the errors there are, or that there is none any more."""
+        """Sends an emergency message with the last of the present errors, or with the code for no error."""
         code = errors[-1] if errors else ErrorCode.NONE
         register = 0
         for error in errors:
@@ -230,7 +239,7 @@ class Node(Profile):
     # process data
 
     def _configure(self) -> None:
-        """Takes PDOs, SYNC and the host's heartbeat as the objects have them."""
+        """Reads the configuration of PDOs, SYNC and the host's heartbeat from the objects."""
         od = self._od
         self._rpdos = {pdo.number: pdo for pdo in pdos(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING)}
         self._tpdos = {pdo.number: pdo for pdo in pdos(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING)}
@@ -278,7 +287,7 @@ class Node(Profile):
         return [self._od[key] for key in pdo.keys if key in _STATES]
 
     def _send_changed(self, time_ns: int) -> None:
-        """Sends TPDOs that go by themselves and whose states have changed, or lets them wait for their inhibit time."""
+        """Sends the TPDOs of type 254 and 255 whose states have changed, at the end of their inhibit time at the earliest."""
         if self.nmt is not Nmt.OPERATIONAL:
             return
         for pdo in self._tpdos.values():
@@ -328,7 +337,7 @@ class Node(Profile):
                     self.refused[f"SDO {Abort(code).name.lower().replace('_', ' ')}"] += 1
 
     def _write(self, key: Key, data: bytes) -> None:
-        """Takes what SDO writes; raises SdoError."""
+        """Writes an object for SDO.  Raises SdoError if this is not allowed."""
         od, time_ns = self._od, self._now_ns
         value = od.parse(key, data)
         check_change(od, key, value)

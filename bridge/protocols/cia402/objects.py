@@ -1,7 +1,7 @@
-"""The object dictionary of a drive: which objects there are, of what type, who may write them, what they begin with.
+"""The object dictionary of a drive: all objects with their types, access rights and defaults.
 
-`OBJECTS` has them all; those whose value depends on the drive's plan have no default there.  A `Dictionary` holds one
-node's values.  What tools read of it is drive.eds (bridge.protocols.cia402.eds).
+`OBJECTS` has all objects.  Those whose value depends on the plan have no default there.  A `Dictionary` holds the values of one
+node.  Tools read the dictionary from drive.eds (bridge.protocols.cia402.eds).
 """
 
 import struct
@@ -18,7 +18,7 @@ Live = Callable[[], int]
 
 
 class Type(Enum):
-    """Data types: the standard's number, and struct's letter (none for text)."""
+    """Data types: the standard's number, and the letter of `struct` (none for text)."""
 
     I8 = (2, "b")
     I16 = (3, "h")
@@ -37,13 +37,15 @@ class Type(Enum):
         self.low, self.high = -top if letter.islower() else 0, top - 1
 
     def clip(self, value: int) -> int:
-        """The nearest number that it holds."""
+        """Returns the nearest number that the type can hold."""
         return self.low if value < self.low else self.high if value > self.high else value
 
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """An object, or one subindex of it.  `access`: `const`, `ro`, or `rw`; `mapped`: a PDO may carry it."""
+    """An object, or one subindex of it.
+
+    `access` is `const`, `ro` or `rw`; `mapped` says whether a PDO may carry it; `low` and `high` limit the values."""
 
     index: int
     sub: int
@@ -51,10 +53,10 @@ class Object:
     type: Type
     access: str = "ro"
     default: Value | None = None
-    """What it begins with; None: it depends on the drive"""
+    """The first value; None: it depends on the drive"""
     mapped: bool = False
     node_added: bool = False
-    """The node id is added to the default"""
+    """True: the node id is added to the default"""
     low: int | None = None
     high: int | None = None
 
@@ -67,10 +69,10 @@ class Object:
 ERROR_REGISTER: Final = (0x1001, 0)
 ERRORS: Final = 0x1003
 MAX_ERRORS: Final = 4
-"""How many of the last errors object 1003 has."""
+"""The number of errors in object 1003."""
 SYNC_COB_ID: Final = (0x1005, 0)
 CONSUMER_HEARTBEAT: Final = (0x1016, 1)
-"""Node << 16 | time [ms]: whose heartbeat the drive waits for."""
+"""Node << 16 | time [ms] of the heartbeat that the drive watches."""
 PRODUCER_HEARTBEAT: Final = (0x1017, 0)
 COMMUNICATION_ERROR: Final = (0x1029, 1)
 RPDO_COMMUNICATION: Final = 0x1400
@@ -80,13 +82,13 @@ TPDO_MAPPING: Final = 0x1A00
 COB_ID, TRANSMISSION, INHIBIT, EVENT_TIMER = 1, 2, 3, 5
 """Subindices of a PDO's communication parameters."""
 PDOS: Final = 4
-"""Of each direction."""
+"""Number of PDOs of each direction."""
 ENTRIES: Final = 8
-"""Objects in a PDO, at most."""
+"""Largest number of objects in a PDO."""
 NOT_VALID: Final = 1 << 31
-"""In a PDO's COB-ID: the PDO is not used."""
+"""Bit in a PDO's COB-ID: the PDO is not used."""
 NO_REMOTE: Final = 1 << 30
-"""In a TPDO's COB-ID: it cannot be asked for."""
+"""Bit in a TPDO's COB-ID: no remote frame can ask for it."""
 TEMPERATURE: Final = (0x2000, 0)
 ABORT_CONNECTION: Final = (0x6007, 0)
 ERROR_CODE: Final = (0x603F, 0)
@@ -109,7 +111,7 @@ TORQUE_SLOPE: Final = (0x6087, 0)
 SUPPORTED_MODES: Final = (0x6502, 0)
 
 RPDO_MAPPED: Final = ((CONTROLWORD, MODE), (TARGET_TORQUE,), (), ())
-"""What each RPDO carries to begin with, and what the host makes it carry; none: not valid."""
+"""The objects in each RPDO, by default and by the host's configuration; a PDO without objects is not valid."""
 TPDO_MAPPED: Final = ((STATUSWORD, MODE_DISPLAY), (POSITION, TORQUE_ACTUAL), (VELOCITY,), ())
 
 NAMES: Final = {
@@ -127,7 +129,7 @@ NAMES: Final = {
     )
     for number in range(PDOS)
 }
-"""What the objects with subindices are called."""
+"""Names of the objects with subindices."""
 
 _VARIABLES = (
     Object(0x1000, 0, "device type", Type.U32, "const", 0x0002_0192),  # a servo drive of profile 402
@@ -172,7 +174,7 @@ def _errors() -> Iterator[Object]:
 
 
 def _communication(number: int) -> Iterator[Object]:
-    """The communication parameters of RPDO and TPDO `number` (from 0)."""
+    """Yields the communication parameters of RPDO and TPDO `number` (from 0)."""
     for index, ids, mapped, flags in (
         (RPDO_COMMUNICATION, RPDO_IDS, RPDO_MAPPED, 0),
         (TPDO_COMMUNICATION, TPDO_IDS, TPDO_MAPPED, NO_REMOTE),
@@ -184,12 +186,12 @@ def _communication(number: int) -> Iterator[Object]:
         yield Object(index + number, TRANSMISSION, "transmission type", Type.U8, "rw", 255 if receives else 1)
         if not receives:
             yield Object(index + number, INHIBIT, "inhibit time [0.1 ms]", Type.U16, "rw", 0)
-        timer = None if receives and number == 1 else 0  # the watchdog of the plan
+        timer = None if receives and number == 1 else 0  # that of RPDO2 is the watchdog of the plan
         yield Object(index + number, EVENT_TIMER, "event timer [ms]", Type.U16, "rw", timer)
 
 
 def mapping_value(key: Key) -> int:
-    """A mapping entry for an object: index, subindex, length in bits."""
+    """Returns the mapping entry of an object: index, subindex, length in bits."""
     return key[0] << 16 | key[1] << 8 | _SIZES[key] * 8
 
 
@@ -215,7 +217,7 @@ INDICES: Final = frozenset(index for index, _ in OBJECTS)
 
 
 class Dictionary:
-    """The objects of one node.  `values` are what the plan says; they stay over a reset, as in a drive that stores them."""
+    """The objects of one node.  `values` come from the plan and survive a reset, like stored parameters."""
 
     def __init__(self, node: int, values: Mapping[Key, int]) -> None:
         self._defaults: dict[Key, Value] = {}
@@ -223,15 +225,15 @@ class Dictionary:
             value = values.get(key, entry.default if entry.default is not None else 0)
             self._defaults[key] = value + node if entry.node_added and isinstance(value, int) else value
         self.live: dict[Key, Live] = {}
-        """Objects whose value is asked for when it is read."""
+        """Functions that return the present value of an object when it is read."""
         self._values = dict(self._defaults)
 
     def reset(self, first: int = 0, last: int = 0xFFFF) -> None:
-        """Gives the objects from index `first` to `last` the values they began with."""
+        """Sets the objects from index `first` to `last` to their first values."""
         self._values |= {key: value for key, value in self._defaults.items() if first <= key[0] <= last}
 
     def __getitem__(self, key: Key) -> int:
-        """The value of an object that is a number."""
+        """Returns the value of an object that is a number."""
         live = self.live.get(key)
         value = self._values[key] if live is None else live()
         assert isinstance(value, int)
@@ -241,13 +243,13 @@ class Dictionary:
         self._values[key] = value
 
     def read(self, key: Key) -> bytes:
-        """The bytes of an object, for SDO.  Raises SdoError."""
+        """Returns the bytes of an object, for SDO.  Raises SdoError if there is no such object."""
         entry = find(key)
         value = self._values[key]
         return value.encode() if isinstance(value, str) else entry.type.layout.pack(entry.type.clip(self[key]))
 
     def parse(self, key: Key, data: bytes) -> int:
-        """What bytes would make of an object.  Raises SdoError if they must not."""
+        """Returns the value of the bytes that SDO writes.  Raises SdoError for a read-only object, a wrong length or value."""
         entry = find(key)
         if entry.access != "rw":
             raise SdoError(Abort.READ_ONLY)
@@ -260,7 +262,7 @@ class Dictionary:
 
 
 def find(key: Key) -> Object:
-    """The object of a key.  Raises SdoError if there is none."""
+    """Returns the object of a key.  Raises SdoError if there is none."""
     entry = OBJECTS.get(key)
     if entry is None:
         raise SdoError(Abort.NO_SUBINDEX if key[0] in INDICES else Abort.NO_OBJECT)

@@ -1,4 +1,4 @@
-"""A passive listener to the CANopen frames of one robot's two drives: what they say, and what must not be."""
+"""The observer of the CANopen frames of a robot's two drives.  Pure."""
 
 from collections.abc import Iterable
 from math import tau
@@ -52,32 +52,34 @@ _AFTER_POWER_ON = frozenset((State.NOT_READY_TO_SWITCH_ON, State.SWITCH_ON_DISAB
 
 
 class _Drive:
-    """One drive as the listener knows it."""
+    """One drive, by its frames."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.reading = WheelReading()
         self.nmt: Nmt | None = None  # None: not known
-        self.start_ns: int | None = None  # when it was last told to start
+        self.start_ns: int | None = None  # time of the last NMT start
         self.state: State | None = None
-        self.may_be: frozenset[State] | None = None  # states it may be in by now
+        self.may_be: frozenset[State] | None = None  # states that the drive may be in by now; None: any
         self.controlword = 0
         self.words: list[tuple[int, int]] = []  # controlwords since the last statusword, each with the one before it
-        self.live = False  # may have had torque since the statusword before the last one
+        self.live = False  # the drive may have had torque since the last statusword but one
 
 
 class Cia402Observer:
     """Listens to the frames of one robot.  Kinds of findings:
 
-    `remote`, `length`, `heartbeat`, `statusword`: no frame of the protocol; `torque above limit`: commanded, beyond the
-    envelope's by more than half a bit; `transition`: a state to which no transition leads from the last one, with the
-    controlwords seen; `enabled without command`: the same for OPERATION ENABLED; `torque while disabled`: reported though
-    the drive cannot have been in OPERATION ENABLED since the report before; `torque after silence`: reported though no
-    target torque came for the watchdog before the time it reports of; `not operational`: a PDO of or for a drive that
-    said it is not.
+    remote, length, heartbeat, statusword    an invalid frame
+    torque above limit                       a commanded torque exceeds the envelope's by more than half a bit
+    transition                               a state that cannot be reached from the last one with the controlwords seen
+    enabled without command                  the same for OPERATION ENABLED
+    torque while disabled                    torque is reported though the drive cannot have been in OPERATION ENABLED
+                                             since the last report
+    torque after silence                     torque is reported though no target torque came for the watchdog's time before
+    not operational                          a PDO from or to a drive that is not OPERATIONAL by its heartbeat
 
-    The first statusword is taken as it is, unless the drive's boot-up was seen.  An emergency message is no finding: it
-    is what `WheelReading.fault` tells.
+    The first statusword may have any state, unless the drive's boot-up was seen.  An emergency message is no finding; it sets
+    `WheelReading.fault`.
     """
 
     def __init__(self, plan: DrivePlan, envelope: EnvelopePlan) -> None:
@@ -91,14 +93,14 @@ class Cia402Observer:
         bases = (EMCY_ID, *_LENGTHS, HEARTBEAT_ID)
         self._functions = {base + node: (base, self._nodes[node]) for base in bases for node in nodes}
         self.identifiers = frozenset((NMT_ID, SYNC_ID, *self._functions))
-        self._syncs_ns: tuple[int, int] | None = None  # when the last two came
+        self._syncs_ns: tuple[int, int] | None = None  # times of the last two SYNCs
         cyclic = (RPDO_IDS[1], *TPDO_IDS[:3])
         self.cyclic = {base + node: plan.period_ns for node in nodes for base in cyclic}
         beat_ns = heartbeat_ns(plan.period_ns, plan.watchdog_ns)
         self.cyclic |= {HEARTBEAT_ID + node: beat_ns for node in nodes}
 
     def observe(self, time_ns: int, frame: Frame) -> list[Finding]:
-        """Takes a frame; returns what is wrong with it.  Other robots' frames say nothing."""
+        """Takes a frame; returns its findings.  Frames of other robots are ignored."""
         if frame.can_id not in self.identifiers:
             return []
         if frame.remote:
@@ -125,7 +127,7 @@ class Cia402Observer:
                 if data[0] == NmtCommand.START:
                     drive.start_ns = time_ns
                 elif drive.may_be is not None:
-                    drive.may_be |= _AFTER_POWER_ON  # it is disabled, or as after power-on
+                    drive.may_be |= _AFTER_POWER_ON  # the drive is disabled, or begins as after power-on
         return []
 
     def _take(self, time_ns: int, base: int, drive: _Drive, data: bytes) -> Iterable[tuple[str, str]]:
@@ -163,7 +165,7 @@ class Cia402Observer:
     def _beat(self, time_ns: int, drive: _Drive, nmt: Nmt) -> None:
         if nmt is Nmt.BOOT_UP:
             drive.may_be, drive.words, drive.controlword = _AFTER_POWER_ON, [], 0
-        # one that had to wait for the bus may tell of the time before the start
+        # a heartbeat that had to wait for the bus may be older than the NMT start
         just_started = drive.start_ns is not None and time_ns - drive.start_ns < self._plan.period_ns
         drive.nmt = None if just_started else nmt
 
@@ -190,7 +192,7 @@ class Cia402Observer:
         if may_be is not None and state not in may_be and state not in _FAULTS:
             kind = "enabled without command" if state is State.OPERATION_ENABLED else "transition"
             yield kind, f"{drive.name}: {state.words} after {drive.reading.state or 'power-on'}"
-        # what was sent since the last statusword may have come after this one was sampled
+        # controlwords since the last statusword may have arrived after this one was sampled
         drive.may_be = _reachable(frozenset((state,)), drive.words)
         drive.words = []
         drive.live = State.OPERATION_ENABLED in (drive.state, *drive.may_be)
@@ -207,7 +209,7 @@ class Cia402Observer:
             return
         if drive.state is not None and not drive.live:
             yield "torque while disabled", f"{drive.name}: {torque:g} N m while {drive.state.words}"
-        # what is reported is of the time between the last two SYNCs
+        # the reported torque is the mean between the last two SYNCs
         since_ns = time_ns - self._plan.period_ns if self._syncs_ns is None else self._syncs_ns[0]
         commanded_ns = drive.reading.commanded_ns
         if commanded_ns is None or since_ns - commanded_ns > self._plan.watchdog_ns:
@@ -215,7 +217,7 @@ class Cia402Observer:
 
 
 def _reachable(states: frozenset[State], words: Iterable[tuple[int, int]]) -> frozenset[State]:
-    """The states that these may lead to, by themselves or by controlwords, each of which may not have been heard yet."""
+    """Returns the states that may be reached from `states` by themselves or by controlwords, any of which may come later."""
     found = _settled(states)
     for word, before in words:
         found |= _settled(frozenset(next_state(state, word, before) for state in found))

@@ -1,8 +1,10 @@
-"""Process data objects: what each carries and when, as its objects say, and which changes of these are allowed.
+"""Process data objects (PDOs): their configuration in the object dictionary, and which changes of it are allowed.
 
-Transmission types: 0 on SYNC, if what it carries has changed; 1 .. 240 on every so-many-th SYNC; 254 and 255 by
-itself: a TPDO when a state that it carries changes, not before its inhibit time is over, and when its event timer is;
-an RPDO acts when it arrives, one of type 0 .. 240 with the next SYNC.
+transmission type    a TPDO is sent                                             an RPDO acts
+0                    on SYNC, if its values have changed                        with the next SYNC
+1 .. 240             on every n-th SYNC, n being the type                       with the next SYNC
+254, 255             when a state in it changes, but not before its inhibit     when it arrives
+                     time is over, and when its event timer expires
 """
 
 import struct
@@ -35,7 +37,7 @@ COMMUNICATION = (
 )
 MAPPING = (*range(RPDO_MAPPING, RPDO_MAPPING + PDOS), *range(TPDO_MAPPING, TPDO_MAPPING + PDOS))
 _MAPPING_OFFSET = RPDO_MAPPING - RPDO_COMMUNICATION
-# identifiers that only management may use
+# identifiers that PDOs must not use
 _RESERVED = (
     *range(0x001, 0x080),
     *range(0x101, 0x181),
@@ -46,21 +48,21 @@ _RESERVED = (
 
 
 class Pdo(NamedTuple):
-    """One process data object as it is configured."""
+    """The configuration of one PDO."""
 
     number: int
-    """From 0"""
+    """Number, counted from 0"""
     can_id: int
     transmission: int
     inhibit_ns: int
     timer_ns: int
-    """Of its event timer; 0: none"""
+    """Event timer [ns]; 0: none"""
     keys: tuple[Key, ...]
     layout: struct.Struct
 
     @property
     def synchronous(self) -> bool:
-        """Whether it waits for SYNC."""
+        """Whether it is sent, or acts, with SYNC."""
         return self.transmission <= SYNCHRONOUS_MAX
 
 
@@ -88,13 +90,13 @@ def pdos(od: Dictionary, communication: int, mapping: int) -> tuple[Pdo, ...]:
 
 
 def pack(pdo: Pdo, values: Sequence[int]) -> bytes:
-    """The data of a PDO for the values of its objects; one that does not fit becomes the nearest that does."""
+    """Returns the data of a PDO with these values of its objects; a value out of range is clipped."""
     fitting = [OBJECTS[key].type.clip(value) for key, value in zip(pdo.keys, values, strict=True)]
     return pdo.layout.pack(*fitting)
 
 
 def check_change(od: Dictionary, key: Key, value: int) -> None:
-    """Raises SdoError if an object of a PDO's configuration must not become this now."""
+    """Raises SdoError if an object of a PDO's configuration must not get this value now."""
     index, sub = key
     if index in COMMUNICATION:
         if sub == COB_ID:

@@ -1,4 +1,4 @@
-"""What a device profile adds to a CANopen node: node.py asks, the device in drive.py answers."""
+"""The interface of a device profile: the methods of the device (drive.py) that the CANopen node (node.py) calls."""
 
 from abc import ABC, abstractmethod
 
@@ -7,44 +7,44 @@ from echelon.bridge.protocols.cia402.sdo import Key
 
 
 class Profile(ABC):
-    """The device behind a node; instants in ns."""
+    """The device behind a node; instants are in ns."""
 
     @abstractmethod
     def _switch_on(self, time_ns: int) -> None:
-        """Begins as after power-on; objects have their first values again."""
+        """Begins as after power-on.  The objects already have their first values."""
 
     @abstractmethod
     def _booted(self, time_ns: int) -> None:
-        """The boot-up message is sent."""
+        """Called when the boot-up message has been sent."""
 
     @abstractmethod
     def _physics(self, time_ns: int) -> None:
-        """Lets the device's own time pass."""
+        """Lets time pass for the device."""
 
     @abstractmethod
     def _sample(self, time_ns: int, key: Key) -> int:
-        """The value of an object for a TPDO."""
+        """Returns the value of an object for a TPDO."""
 
     @abstractmethod
     def _allowed(self, key: Key, value: int) -> bool:
-        """Whether an object of the profile may ever have a value, besides its limits."""
+        """Returns whether an object of the profile may have a value within its limits."""
 
     @abstractmethod
     def _set(self, time_ns: int, key: Key, value: int) -> bool:
-        """Gives an object of the profile an allowed value, with all that follows; false if it is refused now."""
+        """Sets an object of the profile to an allowed value and reacts to it; returns false if it is refused now."""
 
     @abstractmethod
     def _took(self, time_ns: int, pdo: Pdo) -> None:
-        """An RPDO was taken."""
+        """Called when an RPDO has been accepted."""
 
     @abstractmethod
     def _missed(self, time_ns: int) -> None:
-        """An RPDO did not come in time."""
+        """Called when an RPDO did not come in time."""
 
     @abstractmethod
     def _rest(self, time_ns: int) -> None:
-        """The node is no longer operational."""
+        """Called when the node has left the NMT state OPERATIONAL."""
 
     @abstractmethod
     def _without_host(self, time_ns: int) -> None:
-        """The host's heartbeat is lost."""
+        """Called when the host's heartbeat is lost."""

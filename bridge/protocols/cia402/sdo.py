@@ -1,7 +1,9 @@
-"""SDO: reading and writing a node's objects, 8 bytes to and fro.  Expedited (up to 4 bytes in one frame) and segmented
-transfers; block transfers are refused with an abort, as the standard has it for what a node does not support.
+"""SDO: reading and writing a node's objects.  Requests and answers have 8 bytes.
 
-    byte 0      command: bits 7..5 what it is; the others below
+There are expedited transfers (up to 4 bytes of data in one frame) and segmented ones.  Block transfers are refused with an
+abort, as the standard demands for unsupported services.
+
+    byte 0      command: bits 7..5 the kind of message; the other bits depend on it
     byte 1..3   u16 index, u8 subindex      (initiate and abort)
     byte 4..7   data, size or abort code    (initiate and abort)
     byte 1..7   data                        (segment)
@@ -13,7 +15,7 @@ from enum import IntEnum
 
 LENGTH = 8
 MAX_DOWNLOAD = 1024
-"""A node takes no object longer than this [bytes]."""
+"""The longest object that can be written [bytes]."""
 
 _HEAD = struct.Struct("<BHB4s")
 _U32 = struct.Struct("<I")
@@ -24,11 +26,11 @@ _SIZED, _EXPEDITED = 1, 2
 _LAST = 1
 
 Key = tuple[int, int]
-"""Which object: index and subindex."""
+"""An object: index and subindex."""
 
 
 class Abort(IntEnum):
-    """Why a transfer was given up."""
+    """Abort codes: why a transfer was given up."""
 
     TOGGLE = 0x0503_0000
     TIMEOUT = 0x0504_0000
@@ -47,7 +49,7 @@ class Abort(IntEnum):
 
 
 class SdoError(Exception):
-    """A transfer that a node refuses, by its abort code."""
+    """The node refuses a transfer, with this abort code."""
 
     def __init__(self, code: Abort) -> None:
         super().__init__(code)
@@ -55,12 +57,12 @@ class SdoError(Exception):
 
 
 def abort(key: Key, code: int) -> bytes:
-    """The message that gives a transfer up."""
+    """Returns the message that aborts a transfer."""
     return _HEAD.pack(_ABORT << 5, *key, _U32.pack(code))
 
 
 def abort_code(message: bytes) -> int | None:
-    """Why a message gives a transfer up; None if it does not."""
+    """Returns the abort code in a message; None if it is no abort."""
     return _U32.unpack_from(message, 4)[0] if message[0] >> 5 == _ABORT else None
 
 
@@ -69,7 +71,7 @@ def _key(message: bytes) -> Key:
 
 
 def name(key: Key) -> str:
-    """How people write an object: 6071:00."""
+    """Returns the usual notation of an object: 6071:00."""
     return f"{key[0]:04X}:{key[1]:02X}"
 
 
@@ -96,9 +98,9 @@ def _segment_data(message: bytes) -> bytes:
 
 
 class SdoServer:
-    """The node's side, one transfer at a time; a new one takes the place of one that is not finished.
+    """The node's side: one transfer at a time.  A new transfer replaces an unfinished one.
 
-    `read` returns an object's bytes, `write` takes them; both may raise SdoError."""
+    `read` returns an object's bytes, `write` sets them; both may raise SdoError."""
 
     def __init__(self, read: Callable[[Key], bytes], write: Callable[[Key, bytes], None]) -> None:
         self._read = read
@@ -106,16 +108,16 @@ class SdoServer:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the transfer that goes on."""
+        """Forgets an unfinished transfer."""
         self._key = (0, 0)
         self._going = -1
-        """Which kind of segment it waits for."""
+        """The kind of segment that the transfer waits for; -1: there is no transfer."""
         self._toggle = 0
         self._size: int | None = None
         self._data = bytearray()
 
     def answer(self, message: bytes) -> bytes | None:
-        """The answer to a request; None for an abort, which has none.  Whatever comes, it does not raise."""
+        """Returns the answer to a request; None for an abort, which has no answer.  Never raises."""
         command = message[0] >> 5 if len(message) == LENGTH else -1
         try:
             if command in (_DOWNLOAD, _UPLOAD):
@@ -176,14 +178,14 @@ class SdoServer:
 
 
 class SdoClient:
-    """The host's side: one transfer at a time, started by `download` or `upload`, over when `busy` is false."""
+    """The host's side: one transfer at a time.  `download` or `upload` starts it; it is over when `busy` is false."""
 
     def __init__(self) -> None:
         self.busy = False
         self.abort: int | None = None
-        """Why the last transfer failed; None if it did not."""
+        """Abort code of the last transfer; None if it succeeded."""
         self.data = b""
-        """What the last upload gave."""
+        """Data of the last upload."""
         self._key = (0, 0)
         self._upload = False
         self._rest = b""
@@ -193,7 +195,7 @@ class SdoClient:
         self._sent_last = False
 
     def download(self, key: Key, data: bytes) -> bytes:
-        """The request that begins to write an object.  Raises ValueError for no data."""
+        """Returns the first request to write an object.  Raises ValueError for empty data."""
         if not data:
             raise ValueError(f"no data to write to {name(key)}: at least 1 byte is needed")
         self._start(key, upload=False)
@@ -203,7 +205,7 @@ class SdoClient:
         return _sized(_DOWNLOAD, key, len(data))
 
     def upload(self, key: Key) -> bytes:
-        """The request that begins to read an object."""
+        """Returns the first request to read an object."""
         self._start(key, upload=True)
         return _HEAD.pack(_UPLOAD << 5, *key, b"")
 
@@ -213,9 +215,9 @@ class SdoClient:
         self._rest, self._begun, self._toggle, self._size, self._sent_last = b"", False, 0, None, False
 
     def receive(self, message: bytes) -> bytes | None:
-        """Takes an answer; returns the next request, or None when the transfer is over or waits on.
+        """Takes an answer; returns the next request, or None if the transfer is over.
 
-        Raises ValueError for an answer that does not belong to the transfer, which then waits on."""
+        Raises ValueError for an answer that does not belong to the transfer, which then continues to wait."""
         if not self.busy or len(message) != LENGTH:
             raise ValueError(f"no SDO answer that is waited for: {message.hex() or 'no data'}")
         code = abort_code(message)
@@ -282,7 +284,9 @@ class SdoClient:
 
 
 def written(message: bytes) -> tuple[Key, int]:
-    """Which object a request writes in one frame, and the bytes as an unsigned number; object 0000:00 if it does not."""
+    """Returns the object that an expedited request writes, and its bytes as an unsigned number.
+
+    For all other requests the object is 0000:00."""
     if message[0] >> 5 != _DOWNLOAD or not message[0] & _EXPEDITED:
         return (0, 0), 0
     return _key(message), int.from_bytes(_expedited_data(message), "little")

@@ -1,11 +1,20 @@
-"""One drive as its host sees it: bring-up, the way up the state machine, faults and how they end.
+"""The host's side of one drive: bring-up, enabling, faults and recovery.
 
-    pre-operational -> rated torque read and compared, heartbeats, PDOs, mode written -> NMT start
-    -> controlwords 06, 07, 0F, as the statusword in TPDO1 goes on -> target torques in RPDO2
+phase        entered when                               what the host sends
+configure    at first; by recovery, except from the     NMT pre-operational; then the steps of `configuration`, one SDO request
+             drive's state FAULT                        at a time: compare the rated torque, write heartbeats, PDOs and mode
+start        all steps are done                         NMT start, until a heartbeat or a PDO shows OPERATIONAL
+lead         the node is OPERATIONAL                    controlwords 06, 07, 0F, each when the statusword in TPDO1 shows the
+                                                        state before it
+enabled      OPERATION ENABLED and mode 10 are          target torques in RPDO2
+             reported
+fault        emergency message, silence, restart,       nothing; if the plan has a recovery time, a fault reset then (drive in
+             refused step, state FAULT, or OPERATION    FAULT), or a new bring-up
+             ENABLED left without command
+stopped      `stop` or `estop` of the host              controlword 00 or 02, again if it seems to be lost
 
-What is not answered is asked again.  If the plan says after what time, a fault is recovered from: by a reset, or by a new
-bring-up of a drive that was silent or restarted.  A drive whose rated torque is not the plan's is not enabled, since
-torques would mean something else there.
+A request without an answer is repeated.  A drive whose rated torque is not the plan's is not enabled: torques on the bus are
+thousandths of it.
 """
 
 from typing import Final
@@ -45,7 +54,7 @@ from echelon.plan.can_plan import DrivePlan
 _FAULT = "fault"
 _SILENT = "silent"
 PATIENCE: Final = 5
-"""After so many periods without an answer something is sent again."""
+"""After this many periods without an answer a frame is sent again."""
 _UP = {
     State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
     State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
@@ -56,7 +65,7 @@ _UP = {
 
 
 class Wheel:
-    """One drive as its host sees it."""
+    """The host's view of the drive of one wheel."""
 
     def __init__(self, plan: DrivePlan, wheel: int) -> None:
         self.plan = plan
@@ -73,10 +82,10 @@ class Wheel:
         self.bring_up()
 
     def bring_up(self) -> None:
-        """Begins anew, with a drive of which nothing is known."""
+        """Begins the bring-up anew; the drive's state is unknown."""
         self.heard_ns: int | None = None
         self.sdo = SdoClient()
-        self.step = -1  # -1: to be made pre-operational first
+        self.step = -1  # number of the next step; -1: NMT pre-operational comes first
         self.asked_ns: int | None = None
         self.started_ns: int | None = None
         self.nmt: Nmt | None = None
@@ -87,12 +96,12 @@ class Wheel:
 
     @property
     def enabled(self) -> bool:
-        """Whether it takes torque, as far as it said."""
+        """Whether the drive takes torque, by what it reported."""
         there = self.state is State.OPERATION_ENABLED and self.mode == MODE_CYCLIC_TORQUE
         return there and self.nmt is Nmt.OPERATIONAL and not self.fault
 
     def fail(self, time_ns: int, text: str) -> None:
-        """Notes what is wrong; what came first stays, unless it says less."""
+        """Notes a fault.  The first one stays, unless it was only the unspecific `fault`."""
         if not self.fault or self.recovering:
             self.fault_ns = time_ns
         if not self.fault or self.fault == _FAULT:
@@ -100,7 +109,7 @@ class Wheel:
         self.recovering = False
 
     def poll(self, time_ns: int, started: bool) -> list[Frame]:
-        """Returns what is to be sent to it now."""
+        """Returns the frames that are due now."""
         if self._is_silent(time_ns):
             self.fault = ""
             self.fail(time_ns, _SILENT)
@@ -116,7 +125,7 @@ class Wheel:
         return self._lead(time_ns, started)
 
     def _is_silent(self, time_ns: int) -> bool:
-        """Whether it says nothing although its heartbeat is set, which is the second step."""
+        """Whether nothing came for the watchdog's time, although the heartbeat is configured (by the second step)."""
         heard_ns = self.heard_ns if self.step > 1 and self.fault != _SILENT else None
         return heard_ns is not None and time_ns - heard_ns >= self.plan.watchdog_ns
 
@@ -124,14 +133,14 @@ class Wheel:
         return since_ns is None or time_ns - since_ns >= self.retry_ns
 
     def _recover(self, time_ns: int) -> bool:
-        """Whether something may be done about the fault now."""
+        """Begins the recovery from a fault if it is time; returns whether it is under way."""
         after_ns = recovers_after_ns(self.plan, time_ns)
         if after_ns is not None and time_ns - self.fault_ns >= after_ns:
             self.recover()
         return self.recovering
 
     def recover(self) -> None:
-        """Lets `poll` clear what is wrong, and enable the drive anew."""
+        """Lets `poll` clear the fault and enable the drive again."""
         if self.fault and not self.recovering:
             self.recovering = True
             if self.state is not State.FAULT:
@@ -150,23 +159,23 @@ class Wheel:
         return [*frames, Frame(SDO_REQUEST_ID + self.node, request)]
 
     def _lead(self, time_ns: int, started: bool) -> list[Frame]:
-        """Leads the state machine up, or down if it is not to be enabled."""
+        """Returns the controlword that leads the drive up to OPERATION ENABLED, or down if it is not started."""
         if self.state is State.FAULT:
             if not self.recovering:
                 return []
-            # a rising edge is needed, and one that did not help is made again
+            # a fault reset is a rising edge: 00, then 80; it is repeated if it had no effect
             reset = self.controlword == Command.DISABLE_VOLTAGE.value
             if reset or self._late(time_ns, self.controlled_ns):
                 return [self.control(time_ns, Command.FAULT_RESET if reset else Command.DISABLE_VOLTAGE)]
             return []
         if self.state is None:
-            # it should say something after each SYNC
+            # a drive in OPERATIONAL reports after each SYNC: if it does not, start it again
             if self._late(time_ns, self.started_ns):
                 self.nmt = None
             return []
         stopping = not started and self.controlword == Command.QUICK_STOP.value
         if stopping and self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
-            # The drive stops as it is configured to; only a controlword that was lost is sent again.
+            # the drive stops by itself, as it is configured; only a lost controlword is sent again
             lost = self.state is State.OPERATION_ENABLED and self._late(time_ns, self.controlled_ns)
             return [self.control(time_ns, Command.QUICK_STOP)] if lost else []
         command = _UP.get(self.state) if started else Command.DISABLE_VOLTAGE
@@ -189,7 +198,7 @@ class Wheel:
         return Frame(RPDO_IDS[1] + self.node, RPDO2.pack(permille(torque, rated_mnm(self.plan.motor.rated_torque))))
 
     def receive(self, time_ns: int, base: int, data: bytes) -> str:
-        """Takes data of the frame with identifier `base` + node; returns why it is refused, or nothing."""
+        """Takes the data of the frame with identifier `base` + node; returns the reason if they are refused, otherwise ""."""
         why = self._take(time_ns, base, data)
         if not why:
             self.heard_ns = time_ns
@@ -232,7 +241,7 @@ class Wheel:
         if state is None:
             return "statusword"
         before, self.state, self.mode = self.state, state, mode
-        # what a PDO says of NMT holds until the next heartbeat: only an operational node sends it
+        # only an OPERATIONAL node sends PDOs, so the next heartbeat need not be awaited
         self.nmt = Nmt.OPERATIONAL
         if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             if not self.fault:
@@ -253,7 +262,7 @@ class Wheel:
         except ValueError:
             return "SDO answer"
         if follows is not None or self.sdo.busy:
-            # nothing here needs segments
+            # no object of the configuration needs segments
             self.sdo = SdoClient()
             return "SDO answer"
         step = self.steps[self.step]

@@ -1,8 +1,8 @@
-"""Drive, host and observer of the simplest kind of protocol: one drive for both wheels, one command and one feedback per cycle.
+"""Cyclic protocols, the simplest kind: one drive for both wheels, one command and one feedback per cycle.
 
-A command says the wanted torques, which wheels are enabled, and whether to clear faults or to stop in an emergency; feedback
-says the torques that the wheels had, and how they are.  What drives and hosts do with that is the same whatever the bytes are.
-A protocol of this kind derives its classes from those here and adds the bytes.
+A command contains the wanted torques, which wheels are enabled, and whether to clear faults or to make an emergency stop.
+Feedback contains the torques, states and faults of the wheels.  Drive, host and observer here do all that does not depend on
+the bytes.  A protocol of this kind derives its classes from them and adds the bytes.
 """
 
 from echelon.bridge.protocols.cyclic.drive import CyclicDrive

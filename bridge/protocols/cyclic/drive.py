@@ -1,11 +1,16 @@
-"""The virtual drive of both wheels of a robot, in a protocol with one command and one feedback per cycle.
+"""The virtual drive of both wheels of a robot in a cyclic protocol.  Pure: frames and the time in, frames out.
 
-A wheel is enabled by a command that enables it and asks for no torque; one that asks for torque at once is refused, for that
-wheel.  A fault is left by a command that clears and finds its cause gone; that command does not enable.  Without a valid
-command for the watchdog's time an enabled wheel faults.
+Each wheel has a state of its own:
 
-Pure: frames and the time in, frames out.  What a wheel does not accept is counted in `refused`, part by part: a command may be
-good for one wheel and refused for the other.
+state       entered when                                         what a command does there
+disabled    at power-on; by a command without enable, from       with enable and zero torque: enabled; with enable and torque:
+            enabled; by a command that clears, from fault        refused
+enabled     by a command with enable and zero torque             sets the torque; without enable: disabled
+fault       by a fault, an emergency stop, or the watchdog:      with clear: disabled if the cause is gone, otherwise refused;
+            an enabled wheel without a valid command             with torque: refused
+
+A command that clears does not enable.  `refused` counts for each wheel: a command may be accepted by one and refused by the
+other.
 """
 
 from abc import ABC, abstractmethod
@@ -24,7 +29,7 @@ CAUSE_PERSISTS: Final = "cause persists"
 
 
 class CyclicDrive(ABC):
-    """The drive of a robot's wheels; `motors` are the right and the left one.  It listens to `identifiers`."""
+    """The drive of a robot's wheels.  `motors` are the right and the left one; `identifiers` are those it listens to."""
 
     def __init__(self, plan: DrivePlan, identifiers: Iterable[int]) -> None:
         self.plan = plan
@@ -33,30 +38,30 @@ class CyclicDrive(ABC):
         self.refused: Counter[str] = Counter()
         self.states = [WheelState.DISABLED, WheelState.DISABLED]
         self.faults: list[Fault | None] = [None, None]
-        self._silent: set[int] = set()  # wheels for which it was made silent
+        self._silent: set[int] = set()  # wheels at which the fault SILENT was injected
         self._now_ns: int | None = None
-        self._feedback_ns = -NEVER_NS  # when the next one is due
-        self._heard_ns = 0  # when a command fed the watchdog
-        self._pending: list[Frame] = []  # what was due when nobody could be told
+        self._feedback_ns = -NEVER_NS  # when the next feedback is due
+        self._heard_ns = 0  # when a command last fed the watchdog
+        self._pending: list[Frame] = []  # frames that became due in `mend`, which returns none
 
     @abstractmethod
     def decode(self, frame: Frame) -> Command | str:
-        """Returns what a data frame with one of `identifiers` says, or why it is refused.  Raises nothing, whatever comes."""
+        """Returns the command in a data frame with one of `identifiers`, or the reason to refuse it.  Never raises."""
 
     @abstractmethod
     def report(self, torques: tuple[float, float]) -> list[Frame]:
-        """Returns the feedback of an instant; `torques` are means since the last one [N m], `states` and `faults` are the
-        drive's own."""
+        """Returns the feedback frames of an instant: `torques` [N m], means since the last feedback, and the attributes
+        `states` and `faults`."""
 
     @property
     def due_ns(self) -> int:
-        """When it next has something to do on its own: at once before the first call."""
+        """When `advance` must be called next; at once before the first call."""
         if self._pending or self._now_ns is None:
             return -NEVER_NS
         return min(self._feedback_ns, self._expires_ns)
 
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
-        """Takes a command; answers nothing, but for what was due before."""
+        """Takes a command; returns the frames that were due before.  Commands have no answers."""
         frames = self.advance(time_ns)
         if self._silent:
             return frames
@@ -73,7 +78,7 @@ class CyclicDrive(ABC):
         return frames
 
     def advance(self, time_ns: int) -> list[Frame]:
-        """Lets time pass; returns feedback due by then."""
+        """Lets time pass; returns the feedback that is due by then."""
         frames, self._pending = self._pending, []
         if self._now_ns is None:
             period_ns = self.plan.period_ns
@@ -99,7 +104,7 @@ class CyclicDrive(ABC):
                 return frames
 
     def inject(self, time_ns: int, wheel: int, fault: Fault) -> list[Frame]:
-        """Makes a fault of `ON_DEMAND` happen at one wheel; `SILENT` concerns the whole drive.
+        """Makes a fault of `ON_DEMAND` happen at one wheel.  `SILENT` silences the whole drive.
 
         Raises ValueError for another fault or wheel.
         """
@@ -116,7 +121,7 @@ class CyclicDrive(ABC):
         return frames
 
     def mend(self, time_ns: int, wheel: int, fault: Fault) -> None:
-        """Takes the cause of a fault away.  A drive that was silent is as after power-on."""
+        """Takes the cause of a fault away.  A drive that was silent starts as after power-on."""
         self._pending = self._at_wheel(time_ns, wheel, fault)
         if fault is not Fault.SILENT:
             self.motors[wheel].mend(time_ns, fault)
@@ -126,7 +131,7 @@ class CyclicDrive(ABC):
                 self.power_on(time_ns)
 
     def power_on(self, time_ns: int) -> None:
-        """Begins anew, with no wheel enabled; what causes a fault still does."""
+        """Begins anew with both wheels disabled.  Faults whose cause is still present latch again."""
         for wheel, motor in enumerate(self.motors):
             self.states[wheel], self.faults[wheel] = WheelState.DISABLED, None
             for fault in LATCHING:
@@ -146,7 +151,7 @@ class CyclicDrive(ABC):
         return self.advance(time_ns)
 
     def _obey(self, time_ns: int, wheel: int, enable: bool, torque: float, clear: bool) -> None:
-        """Does with one wheel what a valid command says."""
+        """Applies a valid command to one wheel."""
         motor, state = self.motors[wheel], self.states[wheel]
         if state is WheelState.ENABLED:
             if enable:
@@ -169,7 +174,7 @@ class CyclicDrive(ABC):
             self.refused[NOT_CLEARED] += 1
 
     def _fail(self, time_ns: int, wheel: int, fault: Fault) -> None:
-        """Latches a fault; the first one is the one that is told."""
+        """Latches a fault; feedback reports the first one."""
         self.motors[wheel].cut(time_ns)
         if self.states[wheel] is not WheelState.FAULT and not self._silent:
             self.states[wheel], self.faults[wheel] = WheelState.FAULT, fault

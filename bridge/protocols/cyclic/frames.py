@@ -1,4 +1,4 @@
-"""What the frames of a cyclic protocol say, whatever their bytes; right wheel, then left wheel."""
+"""The content of the frames of a cyclic protocol, without their bytes.  Pairs are the right and the left wheel."""
 
 from enum import IntEnum
 from typing import Final, NamedTuple
@@ -6,11 +6,11 @@ from typing import Final, NamedTuple
 from echelon.bridge.protocols.motor import Fault
 
 REMOTE: Final = "remote"
-"""Why a remote frame is refused: nobody answers it."""
+"""The reason to refuse a remote frame: cyclic protocols do not answer them."""
 
 
 class WheelState(IntEnum):
-    """What a wheel's drive does."""
+    """State of a wheel (bridge.protocols.cyclic.drive)."""
 
     DISABLED = 0
     ENABLED = 1
@@ -18,27 +18,27 @@ class WheelState(IntEnum):
 
 
 class Command(NamedTuple):
-    """What a command says."""
+    """The content of a command."""
 
     torques: tuple[float, float]
-    """Wanted wheel torques [N m], 0 for a wheel that is not enabled"""
+    """Wanted wheel torques [N m]; 0 for a wheel that is not enabled"""
     enable: tuple[bool, bool]
     clear: bool
-    """Leave faults whose cause is gone; a command that does so does not enable"""
+    """Clear faults whose cause is gone; a wheel in a fault is not enabled by the same command"""
     estop: bool
-    """Emergency stop: both wheels fault"""
+    """Emergency stop: both wheels enter the fault state"""
 
 
 class Feedback(NamedTuple):
-    """What a feedback says."""
+    """The content of a feedback."""
 
     torques: tuple[float, float]
-    """Mean shaft torques since the feedback before [N m]"""
+    """Mean shaft torques since the last feedback [N m]"""
     states: tuple[WheelState, WheelState]
     faults: tuple[Fault | None, Fault | None]
-    """What is wrong with each wheel; None: nothing, or not told"""
+    """Fault of each wheel; None: no fault, or not reported"""
 
 
 def fault_text(fault: Fault | None) -> str:
-    """Returns a fault in words; empty if it is none."""
+    """Returns a fault in words; "" for None."""
     return "" if fault is None else fault.replace("_", " ")

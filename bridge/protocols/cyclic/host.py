@@ -1,6 +1,15 @@
-"""What commands a robot's drive in a protocol with one command and one feedback per cycle.
+"""The host of a robot's drive in a cyclic protocol.  Pure: frames and the time in, frames out.
 
-Pure: frames and the time in, frames out.  One command per cycle, whatever it says; clearing and enabling are parts of it.
+There is exactly one command per cycle; enabling, clearing and the emergency stop are flags in it:
+
+state       entered when                                       what the commands say
+stopped     `stop` or `estop` is called                        no enable; after `estop` the emergency stop
+bring-up    at first; `start` is called; a fault is cleared    enable with zero torque, until feedback says that both wheels
+                                                               are enabled
+enabled     feedback says that both wheels are enabled         enable with the wanted torques
+fault       feedback reports a fault, or none came for the     no enable; clear from `recovers_after_ns` later on, at once
+            watchdog's time                                    for faults from before a `start`; a later feedback without
+                                                               fault ends it
 """
 
 from abc import ABC, abstractmethod
@@ -21,7 +30,7 @@ _NO_TORQUE: Final = (0.0, 0.0)
 
 
 class CyclicHost(ABC):
-    """The host of a robot's drive; it listens to `identifiers`."""
+    """The host of a robot's drive; `identifiers` are those it listens to."""
 
     def __init__(self, plan: DrivePlan, identifiers: Iterable[int]) -> None:
         self.plan = plan
@@ -30,38 +39,39 @@ class CyclicHost(ABC):
         self.torque = _NO_TORQUE
         self.torque_ns: int | None = None
         self.clipped = 0
-        self._states = _DISABLED  # as last heard
+        self._states = _DISABLED  # as last reported
         self._fault = ""
-        self._fault_ns = 0  # when it was noticed
-        self._clearing_ns: int | None = None  # since when commands clear
+        self._fault_ns = 0  # when the fault was noticed
+        self._clearing_ns: int | None = None  # since when commands clear; None: they do not
         self._started = True
         self._estopped = False
-        self._starts = False  # `start` was called, and `poll` not yet
-        self._old_until_ns = -NEVER_NS  # faults noticed by then are from before a start
+        self._starts = False  # `start` was called, but `poll` was not called since
+        self._old_until_ns = -NEVER_NS  # faults noticed up to this instant are from before `start`
 
     @abstractmethod
     def encode(self, command: Command, saturated: bool) -> list[Frame]:
-        """Returns the frames of a command; torques that do not fit are cut, and may be counted in `clipped`.
+        """Returns the frames of a command.  Torques beyond the range of a frame are cut and may be counted in `clipped`.
 
-        `saturated`: the robot's own torque limit was reached; a protocol may say so."""
+        `saturated`: the robot's own torque limit was reached; a frame may carry this as information."""
 
     @abstractmethod
     def decode(self, frame: Frame) -> Feedback | str | None:
-        """Returns what a data frame with one of `identifiers` says, or why it is refused; None if it is fine, but no feedback.
-        Raises nothing, whatever comes."""
+        """Returns the feedback in a data frame with one of `identifiers`, or the reason to refuse it.
+
+        Returns None for a valid frame that is no feedback.  Never raises."""
 
     @property
     def enabled(self) -> bool:
-        """True while both wheels take torque, as far as their drive said."""
+        """True while both wheels take torque, by the last feedback."""
         return self._started and not self._fault and self._states == _ENABLED
 
     @property
     def fault(self) -> str:
-        """What is wrong, in words; empty if nothing is."""
+        """The present fault in words; empty without one."""
         return self._fault
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Notices silence, and when a fault is to be cleared; sends nothing, for commands say it all."""
+        """Checks for silence and for a fault that may be cleared now.  Returns no frames: the command carries everything."""
         if self.torque_ns is not None and time_ns - self.torque_ns >= self.plan.watchdog_ns:
             self._states = _DISABLED
             self._fail(time_ns, SILENT)
@@ -74,7 +84,7 @@ class CyclicHost(ABC):
         return []
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
-        """Returns the command for wheel torques [N m], finite ones; it says zero while a wheel is not enabled.
+        """Returns the command for wheel torques [N m].  It says zero until both wheels are enabled.
 
         Raises ValueError for torques that are not finite.
         """
@@ -87,18 +97,18 @@ class CyclicHost(ABC):
         return self.encode(Command(_NO_TORQUE, (ready, ready), clear, self._estopped), saturated)
 
     def stop(self, time_ns: int) -> list[Frame]:
-        """Returns the command that disables both wheels; they stay so until `start`."""
+        """Returns the command that disables both wheels.  They stay disabled until `start`."""
         self._halt()
         return self.mirror(0.0, 0.0, False)
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns the command that makes both wheels fault at once; those of all cycles until `start` do, too."""
+        """Returns the command with the emergency stop.  All commands until `start` repeat it."""
         self._halt()
         self._estopped = True
         return self.encode(Command(_NO_TORQUE, (False, False), False, True), False)
 
     def start(self) -> None:
-        """Lets the wheels be enabled (again), whatever was wrong until then."""
+        """Lets the wheels be enabled (again), whatever was wrong before."""
         self._started = self._starts = True
         self._estopped = False
 
@@ -115,7 +125,7 @@ class CyclicHost(ABC):
                 self._fault, self._clearing_ns = "", None
 
     def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
-        """Returns the command for wheel torques [N m], finite ones, whatever the drive says."""
+        """Returns the command for finite wheel torques [N m], whatever the drive reported."""
         torques = (tau_right, tau_left) if enable else _NO_TORQUE
         return self.encode(Command(torques, (enable, enable), False, False), saturated)
 
@@ -131,6 +141,6 @@ class CyclicHost(ABC):
 
 
 def _fault_text(faults: tuple[Fault | None, Fault | None]) -> str:
-    """Returns what is wrong with the wheels, in words; empty if nothing is."""
+    """Returns the faults of the wheels in words; "" without any."""
     named = zip(WHEELS, map(fault_text, faults), strict=True)
     return ", ".join(f"{wheel}: {text}" for wheel, text in named if text)

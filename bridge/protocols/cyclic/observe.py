@@ -1,4 +1,4 @@
-"""A passive listener to the frames of one robot in a protocol with one command and one feedback per cycle.  Pure."""
+"""The observer of one robot in a cyclic protocol.  Pure."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -9,16 +9,20 @@ from echelon.bridge.protocols.observe import Finding, WheelReading
 from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 Said = list[tuple[str, str]]
-"""Findings of one frame: kind and text."""
+"""The findings of one frame: kind and text of each."""
 
 
 class CyclicObserver(ABC):
-    """Listens to a robot's frames, those of `cyclic` (identifiers with their periods [ns]).  Kinds of findings:
+    """Listens to a robot's frames, those of `cyclic` (identifiers with their periods [ns]).
 
-    `remote`: nobody answers remote frames; `torque above limit`: commanded or reported, beyond the envelope's by more than half
-    a `resolution` [N m]; `torque while disabled`: reported by a wheel that was not enabled in the time it reports of; `torque
-    after silence`: reported though no command came for the watchdog and a period; `enabled with torque`: the command that
-    enables already asks for torque; `fault left without clear`; and what `decode` finds.
+    Kinds of findings, in addition to those of `decode`:
+
+    remote                      a remote frame, which cyclic protocols do not answer
+    torque above limit          a commanded or reported torque exceeds the envelope's by more than half a `resolution` [N m]
+    torque while disabled       a wheel reports torque though it was not enabled in the reported time
+    torque after silence        a wheel reports torque though no command came for the watchdog and a period
+    enabled with torque         the first command that enables a wheel already wants torque
+    fault left without clear    a wheel leaves the fault state though no command cleared it
     """
 
     def __init__(self, plan: DrivePlan, envelope: EnvelopePlan, resolution: float, cyclic: Mapping[int, int]) -> None:
@@ -32,16 +36,17 @@ class CyclicObserver(ABC):
         self._last_feedback: Feedback | None = None
         self._command_ns: int | None = None
         self._begin_ns: int | None = None  # when the first frame came
-        self._enabling = [True, True]  # a command enabled the wheel since the last feedback, or may have
-        self._cleared = False  # a command cleared since the last feedback without fault, or may have
+        self._enabling = [True, True]  # since the last feedback, a command may have enabled the wheel
+        self._cleared = False  # since the last feedback without fault, a command may have cleared faults
 
     @abstractmethod
     def decode(self, frame: Frame, said: Said) -> Command | Feedback | None:
-        """Returns what a data frame with one of `identifiers` says, None if it is neither command nor feedback; adds to `said`
-        what is wrong with it."""
+        """Returns the command or feedback in a data frame with one of `identifiers`; None if it is neither.
+
+        Adds its findings to `said`.  Never raises."""
 
     def observe(self, time_ns: int, frame: Frame) -> list[Finding]:
-        """Takes a frame; returns what is wrong with it.  Other robots' frames say nothing."""
+        """Takes a frame; returns its findings.  Frames of other robots are ignored."""
         if frame.can_id not in self.identifiers:
             return []
         if self._begin_ns is None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Native(DriveProtocol):
-    """One drive for both wheels of a robot.  Its identifiers are a base plus the robot's number (codec.py)."""
+    """One drive for both wheels of a robot.  Its identifiers are a base plus the robot's number (see codec.py)."""
 
     wheels: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1),)
     nodes: ClassVar[range] = range(127)
@@ -25,12 +25,12 @@ class Native(DriveProtocol):
         return frozenset(base + node for base in (BASE_ID, FEEDBACK_ID, STATUS_ID))
 
     def addresses(self, drive: DrivePlan) -> dict[str, dict[str, int]]:
-        """Returns the identifiers, for there is no node id to be seen on the bus."""
+        """Returns the identifiers, since no node id is visible on the bus."""
         kinds = ("command", "feedback", "status")
         return {"identifiers": dict(zip(kinds, sorted(self.identifiers(drive.node_ids[0])), strict=True))}
 
     def host(self, drive: DrivePlan) -> Host:
-        """Returns what commands a robot's drive."""
+        """Returns the host of a robot's drive."""
         from echelon.bridge.protocols.native.host import NativeHost
 
         return NativeHost(drive)
@@ -42,13 +42,13 @@ class Native(DriveProtocol):
         return NativeDrive(drive)
 
     def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
-        """Returns what listens to a robot's frames."""
+        """Returns the observer of a robot's frames."""
         from echelon.bridge.protocols.native.observe import NativeObserver
 
         return NativeObserver(drive, envelope)
 
     def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
-        """Returns command, feedback and status."""
+        """Returns the DBC messages of command, feedback and status."""
         from echelon.bridge.protocols.native.dbc import messages
 
         return messages(drive, name)

@@ -1,23 +1,23 @@
 """The native frames: both wheels of one robot in one classic CAN frame. Pure: no input or output, no clock.
 
-All have 8 bytes, little endian; two numbers for the wheels, three bytes, and a CRC. Identifiers are a base plus the
-robot's number, 0 .. 126, so commands win arbitration before feedback, and the lower number before the higher.
+All frames have 8 bytes, little endian: two values for the wheels, three bytes, and a CRC. An identifier is a base plus the
+robot's number, 0 .. 126. So commands win arbitration before feedback, and lower numbers before higher ones.
 
-    command, 0x100 + robot, from the bridge, one per period
-    byte 0..1   wanted torque of the right wheel, i16, times the scenario's torque scale [N m per bit]
-    byte 2..3   of the left wheel, likewise
-    byte 4      flags: bit 0 enable right, bit 1 enable left, bit 2 clear faults, bit 3 clipped (a torque did not fit and
-                was cut to the range of the frame), bit 4 saturated (the robot's own torque limit was reached),
-                bit 5 emergency stop: both wheels fault; bits 6..7 are sent as 0 and not looked at
-    byte 5      bits 0..3 counter; bits 4..7 as bits 6..7 of the flags
-    byte 6      likewise
+    command, 0x100 + robot, from the bridge, once per period
+    byte 0..1   wanted torque of the right wheel, i16, in the scenario's torque scale [N m per bit]
+    byte 2..3   wanted torque of the left wheel, in the same way
+    byte 4      flags: bit 0 enable right, bit 1 enable left, bit 2 clear faults, bit 3 clipped (a torque was cut to the range
+                of the frame), bit 4 saturated (the robot's own torque limit was reached), bit 5 emergency stop (both wheels
+                enter the fault state); bits 6..7 are sent as 0 and ignored
+    byte 5      bits 0..3 counter; bits 4..7 are sent as 0 and ignored
+    byte 6      sent as 0 and ignored
 
-    feedback, 0x180 + robot, from the drive, one per period
+    feedback, 0x180 + robot, from the drive, once per period
     byte 0..3   mean torque of the right and the left shaft since the last feedback, as in the command
     byte 4      state of the right (bits 0..3) and the left wheel (bits 4..7): 0 disabled, 1 enabled, 2 fault
     byte 5      bits 0..3 counter; bits 4..7 zero
-    byte 6      what is wrong with the right (bits 0..3) and the left wheel (bits 4..7): 0 nothing, 1 over-temperature,
-                2 encoder lost, 3 brown-out, 4 watchdog, 5 emergency stop
+    byte 6      fault of the right (bits 0..3) and the left wheel (bits 4..7): 0 none, 1 over-temperature, 2 encoder lost,
+                3 brown-out, 4 watchdog, 5 emergency stop
 
     status, 0x200 + robot, from the drive, with every tenth feedback
     byte 0..3   speed of the right and the left wheel, i16, 0.01 rad/s per bit
@@ -25,17 +25,13 @@ robot's number, 0 .. 126, so commands win arbitration before feedback, and the l
     byte 5      bits 0..3 counter; bits 4..7 zero
     byte 6      temperature of the hotter winding, u8, 1 °C per bit, 0 is -40 °C
 
-    in all of them
+    all frames
     counter     one more with each frame of this identifier, modulo 16
     byte 7      CRC-8 SAE J1850 over the identifier (u16, little endian, not sent) and bytes 0..6
 
-The identifier is part of the CRC so that a frame that reaches the wrong robot is refused there. Wheel numbers are
--32767 to 32767 bits, symmetric; -32768 is never sent and refused. A wheel that a command does not enable gets no torque,
-whatever the command says.
-
-A wheel is enabled by a command that enables it and asks for no torque; one that asks for torque at once is refused, for
-that wheel. Frames that repeat the last counter are refused. A fault is left by a command that clears and finds its
-cause gone; that command does not enable. Without a valid command for the watchdog's time an enabled wheel faults.
+The CRC contains the identifier, so that a robot refuses a frame with a wrong identifier. Wheel values range from -32767 to
+32767; -32768 is never sent and is refused. A wheel that a command does not enable gets no torque. Frames that repeat the last
+counter are refused. bridge.protocols.cyclic.drive has the states of a wheel.
 """
 
 import math
@@ -75,7 +71,7 @@ _BYTES = tuple(bytes((value,)) for value in range(256))
 _BODY = struct.Struct("<hhBBB")  # bytes 0..6
 
 
-# Where the CRC of each identifier's frames stands after the identifier.
+# the CRC after the identifier, computed once for each identifier
 _START = {
     base + robot: crc8(struct.pack("<H", base + robot)) ^ 0xFF
     for base in (BASE_ID, FEEDBACK_ID, STATUS_ID)
@@ -84,7 +80,7 @@ _START = {
 
 
 class Refusal(StrEnum):
-    """Why bytes from the bus are no frame of this protocol."""
+    """Why a frame from the bus is refused."""
 
     ID = "identifier"
     LENGTH = "length"
@@ -93,7 +89,7 @@ class Refusal(StrEnum):
 
 
 class FaultCode(IntEnum):
-    """What is wrong with a wheel."""
+    """Fault of a wheel, as in byte 6 of a feedback."""
 
     NONE = 0
     OVER_TEMPERATURE = 1
@@ -103,13 +99,13 @@ class FaultCode(IntEnum):
     ESTOP = 5
 
 
-# by the nibble's value: a hundred times quicker than to try the enum and catch
+# by the value of the nibble, which is a hundred times as fast as to make the enum and catch ValueError
 _STATES = (*WheelState, *(None,) * (16 - len(WheelState)))
 _FAULTS = (*FaultCode, *(None,) * (16 - len(FaultCode)))
 
 
 class Torque(NamedTuple):
-    """What a valid command says: wheel torques [N m] of one robot, 0 for a wheel that is not enabled."""
+    """The content of a valid command: wheel torques [N m] of one robot, 0 for a wheel that is not enabled."""
 
     robot: int
     tau_right: float
@@ -124,7 +120,7 @@ class Torque(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What a valid feedback says: mean torques [N m], states and faults of the right and the left wheel."""
+    """The content of a valid feedback: mean torques [N m], states and faults of the right and the left wheel."""
 
     robot: int
     torques: tuple[float, float]
@@ -134,7 +130,7 @@ class Feedback(NamedTuple):
 
 
 class Status(NamedTuple):
-    """What a valid status says: speeds of the right and the left wheel [rad/s], supply [V], hotter winding [°C]."""
+    """The content of a valid status: speeds of the right and the left wheel [rad/s], supply [V], hotter winding [°C]."""
 
     robot: int
     speeds: tuple[float, float]
@@ -145,7 +141,7 @@ class Status(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NativeCodec:
-    """Frames from torques and back; `scale` is the scenario's torque scale [N m per bit].
+    """Encodes and decodes frames; `scale` is the scenario's torque scale [N m per bit].
 
     Raises ValueError unless the scale is positive and finite."""
 
@@ -157,7 +153,7 @@ class NativeCodec:
 
     @property
     def limit(self) -> float:
-        """The largest torque a frame can carry [N m]."""
+        """The largest torque that a frame can carry [N m]."""
         return RAW_MAX * self.scale
 
     def encode(
@@ -172,10 +168,10 @@ class NativeCodec:
         clear: bool = False,
         estop: bool = False,
     ) -> tuple[bytes, int]:
-        """The 8 bytes for these wheel torques [N m], and how many of the two were clipped to +-`limit`.
+        """Returns the 8 bytes for these wheel torques [N m], and how many of the two were clipped to ±`limit`.
 
-        The counter is taken modulo 16. `enable` is for the right and the left wheel; where it is false the torque sent
-        is 0. The identifier is `frame_id(robot)`.
+        The counter is taken modulo 16. `enable` is for the right and the left wheel; without it the torque sent is 0. The
+        identifier is `frame_id(robot)`.
         Raises ValueError for a torque that is not finite, or a robot number out of range."""
         if not 0 <= robot < MAX_ROBOTS:
             raise ValueError(f"robot number must be 0 .. {MAX_ROBOTS - 1}, not {robot!r}")
@@ -185,7 +181,7 @@ class NativeCodec:
         if enable[0]:
             flags, right = ENABLE_RIGHT, tau_right / self.scale
             if not -RAW_MAX <= right <= RAW_MAX:
-                # what is less than half a bit too large still rounds to what it should
+                # a torque that is less than half a bit too large rounds to the limit and is not clipped
                 clipped += abs(right) > RAW_MAX + 0.5
                 right = math.copysign(RAW_MAX, right)
         if enable[1]:
@@ -205,7 +201,7 @@ class NativeCodec:
         return body + _BYTES[crc8(body, _START[BASE_ID + robot])], clipped
 
     def decode(self, can_id: int, data: bytes) -> Torque | Refusal:
-        """What a command from the bus says, or why it is refused. Raises nothing, whatever comes."""
+        """Returns the content of a command from the bus, or the reason to refuse it. Never raises."""
         parts = _open(BASE_ID, can_id, data)
         if isinstance(parts, Refusal):
             return parts
@@ -224,7 +220,7 @@ class NativeCodec:
         )
 
     def encode_feedback(self, feedback: Feedback) -> bytes:
-        """The 8 bytes of a feedback; torques are cut to the range. Raises ValueError as `encode` does."""
+        """Returns the 8 bytes of a feedback; torques are cut to the range. Raises ValueError as `encode` does."""
         (right, left), (state_right, state_left) = feedback.torques, feedback.states
         fault_right, fault_left = feedback.faults
         return _seal(
@@ -238,7 +234,7 @@ class NativeCodec:
         )
 
     def decode_feedback(self, can_id: int, data: bytes) -> Feedback | Refusal:
-        """What a feedback from the bus says, or why it is refused. Raises nothing, whatever comes."""
+        """Returns the content of a feedback from the bus, or the reason to refuse it. Never raises."""
         parts = _open(FEEDBACK_ID, can_id, data)
         if isinstance(parts, Refusal):
             return parts
@@ -257,7 +253,7 @@ class NativeCodec:
 
 
 def encode_status(status: Status) -> bytes:
-    """The 8 bytes of a status; what does not fit is cut to the range.
+    """Returns the 8 bytes of a status; values are cut to the range.
 
     Raises ValueError for a number that is not finite, or a robot number out of range."""
     right, left = status.speeds
@@ -276,7 +272,7 @@ def encode_status(status: Status) -> bytes:
 
 
 def decode_status(can_id: int, data: bytes) -> Status | Refusal:
-    """What a status from the bus says, or why it is refused. Raises nothing, whatever comes."""
+    """Returns the content of a status from the bus, or the reason to refuse it. Never raises."""
     parts = _open(STATUS_ID, can_id, data)
     if isinstance(parts, Refusal):
         return parts
@@ -291,7 +287,9 @@ def decode_status(can_id: int, data: bytes) -> Status | Refusal:
 
 
 def frame_id(robot: int, base: int = BASE_ID) -> int:
-    """The identifier of a robot's command, or of another of its frames. ValueError for a number outside 0 .. 126."""
+    """Returns the identifier of a robot's frame: of its command, or of the kind with the identifier `base`.
+
+    Raises ValueError for a robot number outside 0 .. 126."""
     if not 0 <= robot < MAX_ROBOTS:
         raise ValueError(f"robot number must be 0 .. {MAX_ROBOTS - 1}, not {robot!r}")
     return base + robot

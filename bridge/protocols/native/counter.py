@@ -1,16 +1,16 @@
-"""The counter of the native frames: what is missing, and what is repeated.  Pure."""
+"""The counter of the native frames, which shows missing and repeated frames.  Pure."""
 
 from dataclasses import dataclass
 
 COUNTERS = 16
-"""A counter is one more with each frame, modulo this."""
+"""A counter increases by one with each frame, modulo COUNTERS."""
 
 
 @dataclass(slots=True)
 class CounterCheck:
-    """Finds frames that are missing, by the counter of one identifier's frames in the order they arrived.
+    """Counts missing and repeated frames of one identifier by their counters, in the order of arrival.
 
-    A gap is only known modulo 16: sixteen frames lost in a row look like none, and fifteen like a repeated frame."""
+    A gap is known modulo 16 only: sixteen frames lost in a row look like none, fifteen look like a repeated frame."""
 
     frames: int = 0
     missed: int = 0
@@ -18,7 +18,7 @@ class CounterCheck:
     _last: int | None = None
 
     def step(self, counter: int) -> int:
-        """Takes the next frame's counter; how many frames are missing before it, or -1 if it repeats the last one."""
+        """Takes the counter of the next frame; returns how many frames are missing before it, -1 for a repeated frame."""
         self.frames += 1
         last, self._last = self._last, counter
         if last is None:
@@ -31,5 +31,5 @@ class CounterCheck:
         return gap
 
     def forget(self) -> None:
-        """Takes whatever counter comes next: one of the two ends began anew."""
+        """Accepts any counter next, since sender or receiver has begun anew."""
         self._last = None

@@ -1,4 +1,4 @@
-"""CRC-8 SAE J1850, which the native frames end with.  Pure."""
+"""CRC-8 SAE J1850, the last byte of the native frames.  Pure."""
 
 
 def _crc_table() -> bytes:
@@ -15,9 +15,9 @@ _CRC = _crc_table()
 
 
 def crc8(data: bytes, start: int = 0xFF) -> int:
-    """CRC-8 SAE J1850 of `data`: polynomial 0x1D, start 0xFF, inverted at the end.
+    """Returns CRC-8 SAE J1850 of `data`: polynomial 0x1D, start 0xFF, inverted at the end.
 
-    To continue after other data, `start` is their CRC, inverted."""
+    To continue after earlier data, pass their CRC, inverted, as `start`."""
     crc, table = start, _CRC
     for byte in data:
         crc = table[crc ^ byte]

@@ -33,12 +33,12 @@ from echelon.plan.can_plan import DrivePlan
 
 
 def messages(plan: DrivePlan, name: str) -> list[Message]:
-    """Returns command, feedback and status of the robot whose number is the plan's node id; `name` is an identifier of up to 23
-    characters.
+    """Returns command, feedback and status of a robot; `name` is its DBC identifier, up to 23 characters.
 
-    Raises ValueError for a torque scale that is not positive and finite, or a number out of range."""
+    The robot's number is the node id in the plan.  Raises ValueError for a torque scale that is not positive and finite, or a
+    robot number out of range."""
     number = plan.node_ids[0]
-    scale = NativeCodec(plan.torque_scale).scale  # which checks it
+    scale = NativeCodec(plan.torque_scale).scale  # NativeCodec checks it
     drive = f"drive_{name}"
 
     def message(base: int, kind: str, signals: list[Signal], comment: str, sender: str, every: int = 1) -> Message:

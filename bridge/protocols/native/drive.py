@@ -1,4 +1,4 @@
-"""A virtual drive that speaks the native protocol: one drive for both wheels of a robot (bridge.protocols.native.codec)."""
+"""A virtual drive with the native protocol, for both wheels of a robot (bridge.protocols.native.codec)."""
 
 from math import tau
 from typing import Final
@@ -35,7 +35,9 @@ REPEATED: Final = "counter repeated"
 
 
 class NativeDrive(CyclicDrive):
-    """The drive of the robot whose number is the plan's node id.  Raises ValueError for a number outside 0 .. 126."""
+    """The drive of the robot whose number is the node id in the plan.  Raises ValueError for one outside 0 .. 126.
+
+    bridge.protocols.cyclic.drive has the states of a wheel."""
 
     def __init__(self, plan: DrivePlan) -> None:
         self._robot = plan.node_ids[0]
@@ -44,11 +46,11 @@ class NativeDrive(CyclicDrive):
         self._status_id = frame_id(self._robot, STATUS_ID)
         self._codec = NativeCodec(plan.torque_scale)
         self.counter = CounterCheck()
-        """Commands by their counters: how many are missing"""
-        self._sent = 0  # feedback frames
+        """Missing and repeated commands"""
+        self._sent = 0  # number of feedback frames
 
     def decode(self, frame: Frame) -> Command | str:
-        """Returns what a command says; one that repeats the last counter is refused."""
+        """Returns a command, or the reason to refuse it; one that repeats the last counter is refused."""
         said = self._codec.decode(frame.can_id, frame.data) if frame.can_id in self.identifiers else Refusal.ID
         if isinstance(said, Refusal):
             return said
@@ -58,7 +60,7 @@ class NativeDrive(CyclicDrive):
         return Command(torques, enable, said.clear, said.estop)
 
     def report(self, torques: tuple[float, float]) -> list[Frame]:
-        """Returns the feedback of an instant, and the status with every tenth."""
+        """Returns the feedback of an instant, every tenth time with the status."""
         right, left = self.motors
         states, faults = (self.states[0], self.states[1]), (CODES[self.faults[0]], CODES[self.faults[1]])
         feedback = Feedback(self._robot, torques, states, faults, self._sent)
@@ -76,6 +78,6 @@ class NativeDrive(CyclicDrive):
         return frames
 
     def power_on(self, time_ns: int) -> None:
-        """Begins anew, and takes whatever counter comes next."""
+        """Begins anew and accepts any counter next."""
         self.counter.forget()
         super().power_on(time_ns)

@@ -18,7 +18,7 @@ from echelon.plan.can_plan import DrivePlan
 
 
 class NativeHost(CyclicHost):
-    """The host of the robot whose number is the plan's node id.  Raises ValueError for a number outside 0 .. 126."""
+    """The host of the robot whose number is the node id in the plan.  Raises ValueError for one outside 0 .. 126."""
 
     def __init__(self, plan: DrivePlan) -> None:
         self._robot = plan.node_ids[0]
@@ -28,9 +28,9 @@ class NativeHost(CyclicHost):
         super().__init__(plan, [self._feedback_id, self._status_id])
         self._codec = NativeCodec(plan.torque_scale)
         self.status: Status | None = None
-        """Speeds, supply voltage and temperature as last heard"""
+        """The last status: speeds, supply voltage, temperature"""
         self.counter = CounterCheck()
-        """Feedback by its counters: how many are missing"""
+        """Missing and repeated feedback"""
         self._status_counter = CounterCheck()
         self._sent = 0
 
@@ -50,7 +50,7 @@ class NativeHost(CyclicHost):
         return [Frame(self._command_id, data)]
 
     def decode(self, frame: Frame) -> Feedback | str | None:
-        """Returns what a feedback says; takes a status."""
+        """Returns a feedback, or the reason to refuse a frame; keeps a status and returns None for it."""
         if frame.can_id == self._feedback_id:
             said = self._codec.decode_feedback(frame.can_id, frame.data)
             if isinstance(said, Refusal):

@@ -1,4 +1,4 @@
-"""A passive listener to the native frames of one robot: what they say, and what must not be.  Pure."""
+"""The observer of the native frames of one robot.  Pure."""
 
 from echelon.bridge.protocols.cyclic import Command, CyclicObserver, Feedback
 from echelon.bridge.protocols.cyclic.observe import Said
@@ -19,11 +19,14 @@ from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 
 class NativeObserver(CyclicObserver):
-    """Listens to the frames of the robot whose number is the plan's node id.  Kinds of findings, beside those of all protocols
-    of its kind:
+    """Listens to the frames of the robot whose number is the node id in the plan.
 
-    `length`, `crc`, `value`: no frame of the protocol; `counter repeated`, `counter gap`: frames came twice, or are missing;
-    `torque while disabled`: also commanded for a wheel that the same frame does not enable.
+    Kinds of findings, in addition to those of `CyclicObserver`:
+
+    length, crc, value       an invalid frame
+    counter repeated         a frame came twice
+    counter gap              frames are missing
+    torque while disabled    also: a command with torque for a wheel that it does not enable
     """
 
     def __init__(self, plan: DrivePlan, envelope: EnvelopePlan) -> None:
@@ -37,7 +40,7 @@ class NativeObserver(CyclicObserver):
         self._counters = {can_id: CounterCheck() for can_id in self.identifiers}
 
     def decode(self, frame: Frame, said: Said) -> Command | Feedback | None:
-        """Returns what a command or a feedback says; takes the speeds of a status."""
+        """Returns a command or a feedback; keeps the wheel speeds of a status and returns None for it."""
         can_id, data, _ = frame
         if can_id == self._command_id:
             command = self._codec.decode(can_id, data)

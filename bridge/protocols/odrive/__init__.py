@@ -1,4 +1,4 @@
-"""ODrive's CANSimple, firmware 0.6: an axis for each wheel, torque control."""
+"""The protocol of ODrive: CANSimple, firmware 0.6, an axis for each wheel, torque control."""
 
 from typing import TYPE_CHECKING, ClassVar
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class ODrive(DriveProtocol):
-    """An axis for each wheel, each a node with 32 identifiers in a row (bridge.protocols.odrive.codec)."""
+    """An axis for each wheel; each axis is a node with 32 consecutive identifiers (bridge.protocols.odrive.codec)."""
 
     nodes: ClassVar[range] = range(63)
     empty_asks: ClassVar[bool] = True
@@ -24,7 +24,7 @@ class ODrive(DriveProtocol):
         return frozenset(frame_id(node, command) for command in range(32))
 
     def host(self, drive: DrivePlan) -> Host:
-        """Returns what commands a robot's axes."""
+        """Returns the host of a robot's axes."""
         from echelon.bridge.protocols.odrive.host import ODriveHost
 
         return ODriveHost(drive)
@@ -36,7 +36,7 @@ class ODrive(DriveProtocol):
         return ODriveDrive(drive, number)
 
     def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
-        """Returns what listens to a robot's frames; where nobody answers, no heartbeat is missing."""
+        """Returns the observer of a robot's frames; on the mirrored path it expects no heartbeats."""
         from echelon.bridge.protocols.odrive.config import ODriveConfig
         from echelon.bridge.protocols.odrive.observe import ODriveObserver
 
@@ -49,5 +49,5 @@ class ODrive(DriveProtocol):
         return messages(drive, name)
 
     def resolution(self, drive: DrivePlan) -> float:
-        """Returns 0: torques are floating point."""
+        """Returns 0, since torques are floating point."""
         return 0.0

@@ -1,9 +1,9 @@
 """CANSimple of ODrive's firmware 0.6 in classic CAN frames.  Pure: no input or output, no clock.
 
 An identifier has 11 bits: node << 5 | command.  Nodes are 0 .. 62; commands to node 63 are for all, and with it a host
-asks who is there (`ADDRESS` as a remote frame).  Data are little endian, floats IEEE 754.  `MESSAGES` has all commands
-with the names and units of the vendor's DBC (odrive-cansimple-0.6.10); a node answers a remote or an empty frame with
-one of its own reports by a frame with the same identifier.
+asks which nodes are there (`ADDRESS` as a remote frame).  Data are little endian, floats IEEE 754.  `MESSAGES` has all commands
+with the names and units of the vendor's DBC (odrive-cansimple-0.6.10).  A remote or an empty frame with the identifier of
+a report asks for it; the node answers with a frame of the same identifier.
 """
 
 import struct
@@ -29,11 +29,11 @@ BROADCAST: Final = 63
 LENGTH: Final = 8
 """Bytes of every report"""
 ZERO_TORQUE: Final = 1e-6
-"""What passes for no torque [N m]"""
+"""Torques up to this magnitude count as zero [N m]"""
 
 
 class Refusal(StrEnum):
-    """Why bytes from the bus are no message."""
+    """Why a frame from the bus is refused."""
 
     IDENTIFIER = "identifier"
     LENGTH = "length"
@@ -41,14 +41,14 @@ class Refusal(StrEnum):
 
 
 class Signal(NamedTuple):
-    """A value in a message; they stand one after the other, each at a byte's start."""
+    """A value in a message.  Values follow each other; each begins with a byte."""
 
     name: str
     kind: str
-    """A letter of `struct`, or one of `?` (one bit), `u48`"""
+    """A letter of `struct`, or `?` (one bit) or `u48` (48 bits)"""
     unit: str = ""
     scale: float = 1.0
-    """What one bit is, in `unit`"""
+    """Value of one bit in `unit`"""
     choices: type[IntEnum | IntFlag] | None = None
 
 
@@ -69,15 +69,15 @@ class Message:
 
     command: Command
     name: str
-    """In the vendor's DBC, after `AxisN_`"""
+    """Name in the vendor's DBC, after `AxisN_`"""
     reported: bool
-    """True if the drive sends it, on its own or on request; `ADDRESS` goes both ways"""
+    """True if the drive sends it, by itself or on request; `ADDRESS` goes both ways"""
     length: int
-    """Bytes it is sent with"""
+    """Number of bytes with which it is sent"""
     signals: tuple[Signal, ...]
     layout: struct.Struct
     raw: bool
-    """True if values are as `struct` has them"""
+    """True if `struct` packs and unpacks the values without conversion"""
 
     def encode(self, *values: float) -> bytes:
         """Returns the data for the signals' values in order.
@@ -95,9 +95,9 @@ class Message:
             raise ValueError(f"{self.name}: {values!r} do not fit: {error}") from error
 
     def decode(self, data: bytes) -> tuple[Any, ...] | Refusal:
-        """Returns the signals' values in order, or why there are none.  Raises nothing, whatever comes.
+        """Returns the signals' values in order, or the reason to refuse the data.  Never raises.
 
-        Data may be shorter than they are sent usually, but must hold all signals."""
+        Data may be shorter than `length`, but must hold all signals."""
         if not self.layout.size <= len(data) <= LENGTH:
             return Refusal.LENGTH
         values = self.layout.unpack_from(data)
@@ -149,7 +149,7 @@ _CHOICES: Final[Mapping[str, type[IntEnum | IntFlag]]] = {
 
 
 def _message(command: Command, name: str, sender: str, length: int, *rows: str) -> Message:
-    """A row of the table; each signal is its kind, name and unit."""
+    """Makes a message from a row of the table; a signal is written as its kind, name and unit."""
     signals = []
     for row in rows:
         kind, signal, unit = (*row.split(maxsplit=2), "")[:3]

@@ -1,4 +1,4 @@
-"""How an axis is set up: the vendor's names and defaults, but for what a plan says."""
+"""The configuration of an axis, with the vendor's names and defaults; the plan overrides some of them."""
 
 from dataclasses import dataclass
 
@@ -10,27 +10,27 @@ _NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class ODriveConfig:
-    """What the vendor's tool sets in `axis0.config` and `axis0.config.can`; periods in ms, 0 is: only on request.
+    """The fields of `axis0.config` and `axis0.config.can` in the vendor's tool.  Periods are in ms; 0 means: only on request.
 
     Raises ValueError for a negative period."""
 
     heartbeat_msg_rate_ms: int = 100
     error_msg_rate_ms: int = 100
     encoder_msg_rate_ms: int | None = None
-    """None: every period of the plan"""
+    """None: the period of the plan"""
     iq_msg_rate_ms: int = 100
     temperature_msg_rate_ms: int = 100
     bus_voltage_msg_rate_ms: int = 100
     torques_msg_rate_ms: int | None = None
-    """None: every period of the plan"""
+    """None: the period of the plan"""
     powers_msg_rate_ms: int = 0
     enable_watchdog: bool = True
-    """Its timeout is the plan's"""
+    """The timeout of the watchdog is the plan's"""
     every_frame_feeds: bool = False
-    """True: whatever is not refused feeds the watchdog, as in firmware 0.5.6; False: torques and Set_Axis_State do"""
+    """True: every accepted frame feeds the watchdog, as in firmware 0.5.6; False: torques and Set_Axis_State do"""
 
     def periods_ns(self, plan: DrivePlan) -> dict[Command, int]:
-        """Returns the cyclic messages with their periods [ns], those that win arbitration first."""
+        """Returns the cyclic messages with their periods [ns], in the order in which they win arbitration."""
         rates = {
             Command.HEARTBEAT: self.heartbeat_msg_rate_ms,
             Command.GET_ERROR: self.error_msg_rate_ms,

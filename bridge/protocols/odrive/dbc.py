@@ -1,4 +1,4 @@
-"""CANSimple for `echelon dbc`: the vendor's messages and signals for the nodes of a robot.  Pure."""
+"""DBC messages of CANSimple: the vendor's messages and signals for the nodes of a robot.  Pure."""
 
 import re
 from collections import OrderedDict
@@ -17,9 +17,9 @@ from echelon.plan.can_plan import DrivePlan
 
 
 def messages(plan: DrivePlan, robot_name: str, config: ODriveConfig | None = None) -> list[Message]:
-    """Returns all messages of a robot's two axes, as the vendor's DBC has them, with cycle times.
+    """Returns all messages of a robot's two axes as in the vendor's DBC, with cycle times.
 
-    They are called <robot>_<wheel>_<vendor's name>, and the sender of reports drive_<robot>_<wheel>."""
+    A message is named <robot>_<wheel>_<vendor's name>; the sender of reports is drive_<robot>_<wheel>."""
     robot = re.sub(r"\W", "_", robot_name, flags=re.ASCII)
     periods_ns = {**(config or ODriveConfig()).periods_ns(plan), Command.SET_INPUT_TORQUE: plan.period_ns}
     found = []

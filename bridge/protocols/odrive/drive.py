@@ -1,13 +1,19 @@
 """A virtual ODrive axis: one node, one motor, torque control.  Pure: frames and the time in, frames out.
 
-States are IDLE and CLOSED_LOOP_CONTROL.  `Set_Axis_State(8)` is granted when no error is latched and the controller mode
-is TORQUE_CONTROL with PASSTHROUGH; other modes and states, setpoints other than `Set_Input_Torque`, parameters (SDO) and
-addresses cannot be had and are refused.  Limits and gains of other modes are taken and mean nothing here; of
-`Set_Limits` the current limits the torque.  A torque that is too large is limited, as ODrives do.
+state                  entered when                                       what the axis does
+IDLE                   at power-on, after `Reboot`; by                    no torque; refuses `Set_Input_Torque` above zero
+                       `Set_Axis_State(1)`; by any error
+CLOSED_LOOP_CONTROL    by `Set_Axis_State(8)`, if no error is latched     follows `Set_Input_Torque`, cut to the limits; the
+                       and the controller mode is TORQUE_CONTROL with     watchdog is an error
+                       PASSTHROUGH
 
-An error disarms: the torque is cut, the state is IDLE, and it stays so until `Clear_Errors` (which clears only what has
-no cause any more) and a new `Set_Axis_State(8)`.  The first torque after that must be zero, also after a reboot.
-Where fw 0.6 is closed and undocumented, this follows 0.5.6, or `ODriveConfig` has a switch.
+An error latches, cuts the torque and sets the state to IDLE.  `Clear_Errors` clears the errors whose cause is gone.  After an
+error, even with a reboot in between, the first torque in CLOSED_LOOP_CONTROL must be zero.
+
+The axis refuses other modes and states, setpoints other than `Set_Input_Torque`, parameters (SDO) and setting addresses.  It
+accepts limits and gains of other modes without effect.  The current in `Set_Limits` limits the torque.
+
+Firmware 0.6 is closed source.  Where it is not documented, this drive follows 0.5.6, or `ODriveConfig` has a switch.
 """
 
 from collections import Counter
@@ -29,7 +35,7 @@ from echelon.bridge.protocols.odrive.enums import (
 from echelon.plan.can_plan import DrivePlan
 
 VERSION: Final = (2, 0, 0, 0, 0, 6, 10, 0)
-"""CANSimple 2, no real hardware, firmware 0.6.10"""
+"""CANSimple 2, no hardware version, firmware 0.6.10"""
 ERRORS: Final = {
     Fault.OVER_TEMPERATURE: AxisError.MOTOR_OVER_TEMP,
     Fault.ENCODER_LOSS: AxisError.MISSING_ESTIMATE,
@@ -49,9 +55,9 @@ _WITHOUT_EFFECT: Final = (
 
 
 class ODriveDrive:
-    """One axis, the `wheel` (0 right, 1 left) of a plan.
+    """The axis of one `wheel` (0 right, 1 left) of a robot.
 
-    Raises ValueError for another wheel, or a node that is not 0 .. 62."""
+    Raises ValueError for another wheel, or a node id outside 0 .. 62."""
 
     def __init__(self, plan: DrivePlan, wheel: int, config: ODriveConfig | None = None) -> None:
         if wheel not in (0, 1):
@@ -71,8 +77,8 @@ class ODriveDrive:
         self._identifiers = frozenset([*self._ids, *(frame_id(BROADCAST, command) for command in _FOR_ALL)])
         self._periods_ns = self.config.periods_ns(plan)
         self._due_ns: dict[Command, int] = {}
-        self._next_ns = 0  # the first of them
-        self._pending: list[Frame] = []  # to be sent by the next `advance`
+        self._next_ns = 0  # the smallest of _due_ns
+        self._pending: list[Frame] = []  # frames that the next `advance` returns
         self._started = False
         self._mean = 0.0
         self._zero_first = False
@@ -81,12 +87,12 @@ class ODriveDrive:
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers of the frames that it listens to."""
         return self._identifiers
 
     @property
     def due_ns(self) -> int:
-        """When it next has something to do on its own; 0 before the first call."""
+        """When `advance` must be called next; 0 before the first call."""
         return min(self._next_ns, self._deadline_ns) if self._watched else self._next_ns
 
     @property
@@ -100,7 +106,7 @@ class ODriveDrive:
         return self._errors
 
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
-        """Takes a frame; returns what it answers at once."""
+        """Takes a frame; returns the immediate answers."""
         if not self._started:
             self._start(time_ns)
         if self._silent:
@@ -113,7 +119,7 @@ class ODriveDrive:
             return self._refuse("command")
         command = message.command
         answers: list[Frame] = []
-        if command is Command.ESTOP:  # whatever else is wrong with the frame
+        if command is Command.ESTOP:  # an emergency stop is obeyed even if the frame is invalid otherwise
             self._latch(time_ns, AxisError.ESTOP_REQUESTED)
         elif (message.reported or command is Command.ADDRESS) and (remote or not data):
             if command is Command.TX_SDO:
@@ -134,7 +140,7 @@ class ODriveDrive:
         return answers
 
     def advance(self, time_ns: int) -> list[Frame]:
-        """Lets time pass; returns what it sends on its own until then, what is due at `time_ns` included."""
+        """Lets time pass; returns the frames that the axis sends by itself up to and including `time_ns`."""
         if not self._started:
             self._start(time_ns)
         frames, self._pending = self._pending, []
@@ -146,7 +152,7 @@ class ODriveDrive:
         return frames
 
     def inject(self, time_ns: int, wheel: int, fault: Fault) -> list[Frame]:
-        """Makes a fault happen, on demand; returns what was due by then.
+        """Makes a fault happen; returns the frames that are due.
 
         Raises ValueError for the other wheel, and for a fault that only the bus can cause."""
         self._check(wheel, fault)
@@ -162,7 +168,7 @@ class ODriveDrive:
         return frames
 
     def mend(self, time_ns: int, wheel: int, fault: Fault) -> None:
-        """Takes the cause of a fault away; what it latched stays latched until `Clear_Errors`."""
+        """Takes the cause of a fault away.  A latched error stays until `Clear_Errors`."""
         self._check(wheel, fault)
         self._pending = self.advance(time_ns)
         if fault is Fault.SILENT:
@@ -184,19 +190,19 @@ class ODriveDrive:
         self._modes = (int(ControlMode.POSITION_CONTROL), int(InputMode.PASSTHROUGH))
         self._target = 0.0
         self._limit = self.plan.motor.torque_limit
-        self._offset = 0.0  # of the position [rev]
+        self._offset = 0.0  # added to the position [rev]
         self._watched = False
         self._deadline_ns = 0
 
     def _start(self, time_ns: int) -> None:
         self._started = True
-        # the next multiples of the periods, now included
+        # the next multiples of the periods; an instant that is one counts
         self._due_ns = {command: -(-time_ns // period) * period for command, period in self._periods_ns.items()}
         self._next_ns = min(self._due_ns.values(), default=_NEVER)
         self.motor.advance(time_ns)
 
     def _pass(self, time_ns: int) -> None:
-        """Lets time pass until something happens, or to the end."""
+        """Advances the motor to an instant, and latches an error of the motor or of the watchdog."""
         fault = self.motor.advance(time_ns)
         if fault is not None and not self._silent:
             self._latch(time_ns, ERRORS[fault])
@@ -230,7 +236,7 @@ class ODriveDrive:
         return []
 
     def _execute(self, time_ns: int, command: Command, values: tuple[float, ...]) -> str:
-        """Does what a frame for this axis says; returns why not, or nothing."""
+        """Executes a command; returns the reason if it is refused, otherwise ""."""
         if command is Command.SET_INPUT_TORQUE:
             return self._set_torque(time_ns, values[0])
         if command is Command.SET_AXIS_STATE:
@@ -263,7 +269,7 @@ class ODriveDrive:
 
     def _set_torque(self, time_ns: int, torque: float) -> str:
         if self._state is not AxisState.CLOSED_LOOP_CONTROL:
-            # zeros of a host that waits for the state are as good as none
+            # a host sends zeros while it waits for the axis to be enabled: they are no fault
             return "" if abs(torque) <= ZERO_TORQUE else "torque while idle"
         if self._zero_first and abs(torque) > ZERO_TORQUE:
             return "first command not zero"

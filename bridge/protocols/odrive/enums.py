@@ -1,10 +1,10 @@
-"""Numbers of CANSimple and their names, as in the vendor's DBC."""
+"""The enumerations of CANSimple, with the names of the vendor's DBC."""
 
 from enum import IntEnum, IntFlag
 
 
 class Command(IntEnum):
-    """The lower five bits of the identifier."""
+    """The command: the lower five bits of the identifier."""
 
     GET_VERSION = 0x00
     HEARTBEAT = 0x01
@@ -37,7 +37,7 @@ class Command(IntEnum):
 
 
 class AxisState(IntEnum):
-    """What an axis does, or is asked to do."""
+    """State of an axis, also in requests."""
 
     UNDEFINED = 0
     IDLE = 1
@@ -57,7 +57,7 @@ class AxisState(IntEnum):
 
 
 class ControlMode(IntEnum):
-    """What an axis controls."""
+    """The quantity that an axis controls."""
 
     VOLTAGE_CONTROL = 0
     TORQUE_CONTROL = 1
@@ -66,7 +66,7 @@ class ControlMode(IntEnum):
 
 
 class InputMode(IntEnum):
-    """How an axis gets from one setpoint to the next."""
+    """How an axis moves from one setpoint to the next."""
 
     INACTIVE = 0
     PASSTHROUGH = 1
@@ -80,7 +80,7 @@ class InputMode(IntEnum):
 
 
 class AxisError(IntFlag):
-    """What is wrong; several bits may be set."""
+    """Error bits of an axis; several may be set."""
 
     NONE = 0
     INITIALIZING = 0x1
@@ -108,7 +108,7 @@ class AxisError(IntFlag):
 
 
 class ProcedureResult(IntEnum):
-    """What became of the last request for a state or a mode."""
+    """Result of the last request for a state or a mode."""
 
     SUCCESS = 0
     BUSY = 1
@@ -129,7 +129,7 @@ class ProcedureResult(IntEnum):
 
 
 class RebootAction(IntEnum):
-    """What to reboot for."""
+    """Kind of reboot."""
 
     reboot = 0  # the vendor's DBC has these in lower case
     save_configuration = 1
@@ -138,17 +138,17 @@ class RebootAction(IntEnum):
 
 
 class SdoOpcode(IntEnum):
-    """What to do with a parameter."""
+    """Access to a parameter."""
 
     READ = 0
     WRITE = 1
 
 
-_ERRORS = tuple((error.value, str(error.name)) for error in AxisError)  # plain numbers: flags are slow
+_ERRORS = tuple((error.value, str(error.name)) for error in AxisError)  # plain numbers, since flags are slow
 
 
 def error_names(errors: int) -> str:
-    """Returns the vendor's names of error bits with `|` between, bits without a name as a number; empty if none is set."""
+    """Returns the vendor's names of the set error bits, joined by `|`; bits without a name are a number.  "" if none is set."""
     if not errors:
         return ""
     names = [name for bit, name in _ERRORS if errors & bit]

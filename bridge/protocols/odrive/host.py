@@ -1,12 +1,21 @@
-"""The host of a robot's two ODrive axes: brings them up as ros2_control's ODrive interface does, and commands torques.
+"""The host of a robot's two ODrive axes: it brings them up as ros2_control's ODrive interface does, and commands torques.
 
-    Set_Controller_Mode(TORQUE_CONTROL, PASSTHROUGH), Clear_Errors where there are some, Set_Axis_State(8),
-    and Set_Input_Torque every cycle: zeros until both heartbeats say CLOSED_LOOP_CONTROL, and once more then
+Each axis is in one of these states:
 
-and again after 200 ms without success.  An error, silence, or a state that was not asked for is a fault, and so is no
-torque at all where some is commanded, which shows sooner than the next heartbeat does: torques are zero for both wheels
-from then on.  What was wrong before an axis was first enabled is cleared at once; what goes wrong later
-only after `recover_ns`, or by `start`.
+state       entered when                                       what the host sends
+prepare     at first; `start` is called; `RETRY_NS` after a    Set_Controller_Mode(TORQUE_CONTROL, PASSTHROUGH), and
+            request without success                            Clear_Errors if there are errors
+request     `SETTLE_NS` after prepare                          Set_Axis_State(8)
+closed      a heartbeat says CLOSED_LOOP_CONTROL after the     nothing more; torques flow when both axes are closed
+            request
+fault       an error; silence for the watchdog's time; IDLE    nothing until it may recover, then prepare; an axis that was
+            without request; zero torque is reported though    not closed since `start` recovers at once, others after
+            torque is commanded                                `recovers_after_ns`
+stopped     `stop` or `estop` is called                        Set_Axis_State(1) or Estop, again while a heartbeat says
+                                                               CLOSED_LOOP_CONTROL
+
+Set_Input_Torque is sent in every cycle: zeros until both axes are closed, one more zero then, and zeros after a fault of either
+axis.
 """
 
 from collections import Counter
@@ -20,10 +29,10 @@ from echelon.bridge.protocols.odrive.enums import AxisState, Command, ControlMod
 from echelon.plan.can_plan import DrivePlan
 
 RETRY_NS: Final = 200_000_000
-"""Two heartbeats: so long an answer may take"""
+"""How long the host waits for success before it tries again: two periods of the heartbeat"""
 SETTLE_NS: Final = 50_000_000
-"""Between the mode of an axis and the request to take torque, which has the lower identifier: on a busy bus it would be there
-first, and the axis close its loop in another mode"""
+"""Pause between Set_Controller_Mode and Set_Axis_State.  The latter has the lower identifier: without the pause it could arrive
+first on a busy bus, and the axis would close its loop in another mode"""
 SILENT: Final = "silent"
 NO_TORQUE: Final = "gives no torque"
 _HEARD: Final = (Command.HEARTBEAT, Command.GET_ERROR, Command.GET_ENCODER_ESTIMATES, Command.GET_TORQUES)
@@ -32,33 +41,33 @@ _TORQUE: Final = MESSAGES[Command.SET_INPUT_TORQUE]
 
 @dataclass(slots=True)
 class _Axis:
-    """What is known of one axis."""
+    """The host's view of one axis."""
 
     node: int
     state: int = AxisState.UNDEFINED
     errors: int = 0
     closed: bool = False
-    """It takes torque, by its last heartbeat"""
+    """The axis takes torque, by its last heartbeat"""
     fresh: bool = True
-    """Not enabled since `start`: what is wrong is of the past"""
+    """The axis was not enabled since `start`, so its faults are from before"""
     fault: str = ""
     fault_ns: int = 0
     pushed_ns: int | None = None
-    """Since then its commands are not zero"""
+    """Since when its commanded torques are not zero; None: they are"""
     heard_ns: int | None = None
     prepared_ns: int | None = None
-    """When it was told its mode, and is yet to be asked to take torque"""
+    """When its mode was sent, if Set_Axis_State has yet to follow"""
     asked_ns: int | None = None
     torque: float = 0.0
     torque_ns: int | None = None
 
     @property
     def asked(self) -> bool:
-        """True if it was asked to take torque, and again since what went wrong, if anything did."""
+        """True if it was requested to take torque, and requested again since its last fault."""
         return self.asked_ns is not None and (self.fresh or not self.fault or self.asked_ns >= self.fault_ns)
 
     def bring_up(self, time_ns: int) -> list[Frame]:
-        """Returns what is due of two steps: mode, and errors cleared; then the request to take torque."""
+        """Returns the frames of the next step of the bring-up: mode and clearing of errors, or the request to take torque."""
         if self.prepared_ns is not None:
             if time_ns - self.prepared_ns < SETTLE_NS:
                 return []
@@ -69,7 +78,7 @@ class _Axis:
         return [*frames, self.send(Command.CLEAR_ERRORS, 0)] if self.errors else frames
 
     def forget(self) -> None:
-        """What it was asked is void."""
+        """Forgets the requests, so that the bring-up begins anew."""
         self.prepared_ns = self.asked_ns = None
 
     def send(self, command: Command, *values: float) -> Frame:
@@ -97,39 +106,39 @@ class ODriveHost:
         self._torque_ids = tuple(frame_id(axis.node, Command.SET_INPUT_TORQUE) for axis in self._axes)
         self._started = True
         self._halts = Command.SET_AXIS_STATE
-        """What halts an axis that is not started: `Set_Axis_State` with IDLE, or `Estop`"""
+        """The command that stopped axes get: `Set_Axis_State` with IDLE, or `Estop`"""
         self._zero_first = True
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers of the frames that it listens to."""
         return self._identifiers
 
     @property
     def enabled(self) -> bool:
-        """True while both wheels take torque, as far as their drives said."""
+        """True while both wheels take torque, by what their drives reported."""
         right, left = self._axes
         return right.closed and left.closed
 
     @property
     def fault(self) -> str:
-        """What a drive reports to be wrong, in words; empty if nothing is."""
+        """The present faults of the axes in words; empty without any."""
         return "; ".join(f"{wheel}: {axis.fault}" for wheel, axis in zip(WHEELS, self._axes, strict=True) if axis.fault)
 
     @property
     def torque(self) -> tuple[float, float]:
-        """Torque of the right and left wheel as the drives last reported it [N m]; zeros before the first report."""
+        """The last reported torques of the right and the left wheel [N m]; zeros before the first report."""
         right, left = self._axes
         return right.torque, left.torque
 
     @property
     def torque_ns(self) -> int | None:
-        """When the older of the two reports came; None before both have."""
+        """When the older of the two reports came [ns]; None before both have come."""
         right, left = (axis.torque_ns for axis in self._axes)
         return None if right is None or left is None else min(right, left)
 
     def poll(self, time_ns: int) -> list[Frame]:
-        """Returns what is due besides torques: to bring axes up, or clear a fault and enable anew."""
+        """Returns all due frames except torques: they bring axes up, clear faults and enable again."""
         frames: list[Frame] = []
         for axis in self._axes:
             heard_ns = axis.heard_ns
@@ -146,9 +155,9 @@ class ODriveHost:
         return frames
 
     def command(self, time_ns: int, tau_right: float, tau_left: float, saturated: bool = False) -> list[Frame]:
-        """Returns the frames for wheel torques [N m]; zeros are sent while a drive is not enabled.
+        """Returns the frames for wheel torques [N m], cut to the limit of the motors.
 
-        They are limited to what the motors can give.  Raises ValueError for a torque that is not finite."""
+        It sends zeros until both axes are closed.  Raises ValueError for a torque that is not finite."""
         limit = self.plan.motor.torque_limit
         if not self.enabled:
             limit = 0.0
@@ -158,7 +167,7 @@ class ODriveHost:
         for axis, can_id, torque in zip(self._axes, self._torque_ids, (tau_right, tau_left), strict=True):
             if not isfinite(torque):
                 raise ValueError(f"torques must be finite, not {tau_right!r} and {tau_left!r}")
-            torque = max(-limit, min(limit, torque)) + 0.0  # and no -0.0
+            torque = max(-limit, min(limit, torque)) + 0.0  # + 0.0 turns -0.0 into 0.0
             if abs(torque) <= ZERO_TORQUE:
                 axis.pushed_ns = None
             elif axis.pushed_ns is None:
@@ -167,18 +176,18 @@ class ODriveHost:
         return frames
 
     def stop(self, time_ns: int) -> list[Frame]:
-        """Returns frames that take the torque away at once and disable the drives; they stay so until `start`."""
+        """Returns frames that take the torque away at once and disable the drives.  They stay disabled until `start`."""
         self._halt(Command.SET_AXIS_STATE)
         frames = [axis.send(Command.SET_INPUT_TORQUE, 0.0) for axis in self._axes]
         return frames + [self._halt_frame(axis) for axis in self._axes]
 
     def estop(self, time_ns: int) -> list[Frame]:
-        """Returns frames after which the drives have an error and no torque; `start` clears and enables them."""
+        """Returns Estop for both axes: they latch an error and take the torque away.  `start` clears and enables them."""
         self._halt(Command.ESTOP)
         return [self._halt_frame(axis) for axis in self._axes]
 
     def start(self) -> None:
-        """Lets `poll` enable the drives (again), whatever was wrong before.  A new host is started."""
+        """Lets `poll` enable the drives (again), whatever was wrong before.  A new host is started already."""
         self._started = True
         for axis in self._axes:
             axis.fresh = True
@@ -201,7 +210,8 @@ class ODriveHost:
         axis.heard_ns = time_ns
         if command is Command.GET_TORQUES:
             axis.torque, axis.torque_ns = values[1], time_ns
-            # exactly none is what an axis reports that gives none; commands may take their time, or one be lost
+            # A disarmed axis reports exactly zero, which shows before its next heartbeat.  Three periods allow for commands
+            # that are delayed or lost.
             pushed = axis.pushed_ns is not None and time_ns - axis.pushed_ns >= 3 * self.plan.period_ns
             if axis.closed and pushed and values == (0.0, 0.0):
                 axis.fail(time_ns, NO_TORQUE)
@@ -211,7 +221,7 @@ class ODriveHost:
             self._error(axis, time_ns, values[0])
 
     def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
-        """Returns the frames for wheel torques [N m], finite ones, whatever the axes say."""
+        """Returns the frames for finite wheel torques [N m], whatever the axes reported."""
         torques = (tau_right, tau_left) if enable else (0.0, 0.0)
         return [Frame(can_id, _TORQUE.encode(torque)) for can_id, torque in zip(self._torque_ids, torques, strict=True)]
 
@@ -230,7 +240,7 @@ class ODriveHost:
 
     def _error(self, axis: _Axis, time_ns: int, errors: int) -> None:
         if not axis.errors:
-            axis.forget()  # asked without knowing: `Clear_Errors` was missing
+            axis.forget()  # the bring-up began before the error was known, without `Clear_Errors`: begin anew
         axis.errors = errors
         axis.fail(time_ns, error_names(errors))
 

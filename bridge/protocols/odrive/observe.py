@@ -1,7 +1,17 @@
-"""What a passive listener makes of the frames of a robot's two ODrive axes.
+"""The observer of a robot's two ODrive axes.  Pure.
 
-It knows only what is on the bus, and allows for what that cannot tell: a heartbeat says what was up to 100 ms ago, and a
-torque report is a mean over the period before it.
+It knows only the frames, and allows for their age: a state in a heartbeat may be up to 100 ms old, and a torque report is a
+mean over the period before it.
+
+kind of finding                    meaning
+command, length, not finite        an invalid frame
+state                              a heartbeat with an unknown axis state
+heartbeat missing                  no heartbeat for one and a half of its periods
+torque above limit                 a commanded torque exceeds the envelope's
+torque while idle                  an axis reports torque though it was IDLE for the reported time
+torque after silence               an axis reports torque though nothing fed its watchdog in time
+enabled unasked                    CLOSED_LOOP_CONTROL without a `Set_Axis_State(8)` before
+error while enabled                a heartbeat in CLOSED_LOOP_CONTROL with an error
 """
 
 from dataclasses import dataclass, field
@@ -16,29 +26,29 @@ from echelon.bridge.protocols.odrive.enums import AxisState, Command, error_name
 from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 ROUNDING: Final = 1e-6
-"""Relative; more than a 32-bit float's"""
+"""Relative tolerance of limits; it is larger than the rounding of 32-bit floats"""
 
 
 @dataclass(slots=True)
 class _Axis:
-    """What was seen of one axis."""
+    """One axis, by its frames."""
 
     wheel: WheelReading = field(default_factory=WheelReading)
     state: int | None = None
     asked: bool = False
-    """Set_Axis_State(8) was seen since the last heartbeat with that state"""
+    """A Set_Axis_State(8) was seen since the last heartbeat in CLOSED_LOOP_CONTROL"""
     idle_ns: int | None = None
-    """It is IDLE since this heartbeat at the latest, and was not asked to leave it"""
+    """Heartbeat since which the axis is certainly IDLE, without a request to leave it"""
     alive_ns: int | None = None
-    """Last heartbeat, or the first frame of all"""
+    """Time of the last heartbeat, or of the first frame if there was none"""
     missing: bool = False
-    """What is missing was told"""
+    """The missing heartbeat was reported as a finding"""
     fed_ns: int | None = None
-    """Last frame that feeds the watchdog, or the first frame of all"""
+    """Time of the last frame that feeds the watchdog, or of the first frame if there was none"""
 
 
 class ODriveObserver:
-    """Listens to one robot; `config` is what its axes are set up with."""
+    """Listens to the axes of one robot; `config` is their configuration."""
 
     def __init__(self, plan: DrivePlan, envelope: EnvelopePlan, config: ODriveConfig | None = None) -> None:
         self.plan = plan
@@ -61,16 +71,16 @@ class ODriveObserver:
 
     @property
     def identifiers(self) -> frozenset[int]:
-        """Identifiers of the frames it looks at."""
+        """Identifiers of the frames that it looks at."""
         return self._identifiers
 
     @property
     def cyclic(self) -> dict[int, int]:
-        """Identifiers that must come regularly, with their periods [ns]."""
+        """Cyclic identifiers with their periods [ns]."""
         return self._cyclic
 
     def observe(self, time_ns: int, frame: Frame) -> list[Finding]:
-        """Takes a frame; returns what is wrong with it."""
+        """Takes a frame; returns its findings.  Frames of other robots are ignored."""
         found = self._by_id.get(frame.can_id)
         if found is None:
             return []
@@ -134,7 +144,7 @@ class ODriveObserver:
     def _check_torque(self, axis: _Axis, time_ns: int, torque: float, wrong: list[tuple[str, str]]) -> None:
         if abs(torque) <= ZERO_TORQUE:
             return
-        since_ns = time_ns - self.plan.period_ns  # what the mean begins with
+        since_ns = time_ns - self.plan.period_ns  # start of the reported mean
         if axis.idle_ns is not None and since_ns >= axis.idle_ns:
             wrong.append(("torque while idle", f"{torque:.6g} N m"))
         if axis.fed_ns is not None and since_ns - axis.fed_ns > self.plan.watchdog_ns:

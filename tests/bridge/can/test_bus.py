@@ -1,4 +1,4 @@
-"""Buses that need no privileges, URLs, and a bus that misbehaves."""
+"""CAN buses that need no privileges, their URLs, and errors on a bus."""
 
 import errno
 import socket
@@ -93,7 +93,7 @@ def test_interface_that_is_missing() -> None:
 
 
 def own_url(kind: str) -> str:
-    # a port, or a channel, that nobody else has
+    # a port, or a channel, that no other test uses
     return resolve_url("auto") if kind == "udp_multicast" else f"virtual:{uuid.uuid4()}"
 
 
@@ -124,12 +124,12 @@ ODD = [
     msgpack.packb({"arbitration_id": can_id, "is_extended_id": False, "is_remote_frame": remote, "data": b"", "dlc": 0})
     for can_id, remote in [(5.0, False), (float("nan"), False), (True, False), (5, "x"), (5, [1]), (5, 2)]
 ]
-"""Datagrams that python-can takes for frames"""
+"""Invalid datagrams that python-can decodes as frames"""
 
 
 @pytest.fixture
 def multicast() -> Iterator[tuple[Bus, can.BusABC]]:
-    """A bus of ours, and python-can's own on the same group and port."""
+    """A bus of this project and one of python-can, on the same group and port."""
     with open_or_skip(own_url("udp_multicast")) as bus:
         group, _, port = bus.url.partition(":")[2].rpartition(":")
         with can.Bus(
@@ -151,11 +151,11 @@ def test_python_can_takes_our_datagrams_and_we_take_its(
     assert (came.arbitration_id, bytes(came.data), came.dlc) == (can_id, data, len(data))
     assert (came.is_remote_frame, came.is_extended_id, came.is_error_frame, came.is_fd) == (remote, False, False, False)
     plain.send(can.Message(arbitration_id=can_id, data=data, is_remote_frame=remote, is_extended_id=False))
-    answer = bus.recv(5.0)  # and not what it sent itself, though it is the same
+    answer = bus.recv(5.0)  # python-can's frame, not the equal frame that the bus sent itself
     assert answer is not None
     assert (answer.can_id, answer.data, answer.remote) == (can_id, data, remote)
     assert abs(answer.time_ns - time.time_ns()) < 60_000_000_000
-    assert plain.recv(5.0) is not None  # python-can does hear itself
+    assert plain.recv(5.0) is not None  # python-can receives its own frames
 
 
 def test_when_the_way_to_the_group_changes_the_next_frame_takes_the_new_one(
@@ -232,7 +232,7 @@ def test_no_classic_frame(can_id: int, data: bytes) -> None:
 
 
 class Socket:
-    """Stands for a raw CAN socket; each send takes the next of `answers`, an errno or 0."""
+    """Stands for a raw CAN socket.  Each send fails with the next errno of `answers`; 0 is success."""
 
     def __init__(self, answers: list[int], bind: int = 0) -> None:
         self.answers = answers
@@ -296,7 +296,7 @@ def test_receiving_on_a_raw_socket() -> None:
 
 
 class Stamped:
-    """Stands for a raw CAN socket from which frames come with these stamps [ns]."""
+    """Stands for a raw CAN socket whose frames have these time stamps [ns]."""
 
     def __init__(self, stamps: list[int]) -> None:
         self.stamps = stamps
@@ -310,7 +310,7 @@ class Stamped:
 
 
 def test_stamps_of_frames_do_not_run_backwards_but_with_the_clock() -> None:
-    """Two processors stamp side by side; a clock that is set back by seconds is another matter."""
+    """Stamps of two processors may be out of order by microseconds, which is corrected; a clock set back by seconds is not."""
     bus, _, _ = raw_bus([])
     at, back = 1_700_000_000_000_000_000, 5_000_000_000
     bus._wire = RawCan(Stamped([at, at - 2_000, at + 1, at - back, at - back + 7]), "vcan0")  # type: ignore[arg-type]
@@ -358,10 +358,10 @@ def test_a_full_queue_is_retried_then_dropped_and_holds_up_only_once() -> None:
     assert len(pauses) == 2
     assert not bus.send(2, b"")
     assert len(pauses) == 12
-    assert not bus.send(3, b"")  # still full: tried once
+    assert not bus.send(3, b"")  # the queue is still full: one attempt only
     assert len(pauses) == 13
     assert bus.send(4, b"")
-    assert bus.send(5, b"")  # patient again
+    assert bus.send(5, b"")  # after a success there are several attempts again
     assert raw.answers == []
     assert (bus.counts.sent, bus.counts.dropped, bus.counts.failed) == (3, 2, 0)
     assert sum(pauses[2:12]) <= 0.005 + 1e-9
@@ -369,7 +369,7 @@ def test_a_full_queue_is_retried_then_dropped_and_holds_up_only_once() -> None:
 
 
 class Grumbler:
-    """Stands for python-can's bus; each send takes the next of `answers`, an error or None."""
+    """Stands for python-can's bus.  Each send raises the next error of `answers`; None is success."""
 
     def __init__(self, answers: list[Exception | None]) -> None:
         self.answers = answers

@@ -1,4 +1,4 @@
-"""can.log: its lines, who can read them, and what happens when the process dies or the disk is full."""
+"""can.log: its lines, the tools that read them, a killed process, and a full disk."""
 
 import os
 import resource

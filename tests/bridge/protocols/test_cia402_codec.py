@@ -1,4 +1,4 @@
-"""The frames, words and tables of CiA 402 and CANopen, held against the package `canopen`."""
+"""The frames, words and tables of CiA 402 and CANopen, compared with the package `canopen`."""
 
 import struct
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_transitions_are_those_of_the_package() -> None:
     by_itself |= {("FAULT REACTION ACTIVE", "FAULT")}
     theirs = {(a, COMMANDS[word], b) for (a, b), word in State402.TRANSITIONTABLE.items() if (a, b) not in by_itself}
     assert theirs <= ours
-    assert ours - theirs == {  # which the package never asks for
+    assert ours - theirs == {  # the package has no such request
         ("READY TO SWITCH ON", Command.ENABLE_OPERATION, "OPERATION ENABLED"),
         ("READY TO SWITCH ON", Command.QUICK_STOP, "SWITCH ON DISABLED"),
         ("SWITCHED ON", Command.QUICK_STOP, "SWITCH ON DISABLED"),
@@ -144,7 +144,7 @@ def test_times() -> None:
 
 
 def entries(node: int) -> dict[tuple[int, int], ODVariable]:
-    """What the package reads in drive.eds."""
+    """Returns the objects that the package reads from drive.eds."""
     found = {}
     for index, entry in canopen.import_od(str(EDS), node).items():
         if isinstance(entry, ODVariable):

@@ -30,7 +30,7 @@ SIZES = {0x6040: 2, 0x6060: 1, 0x6071: 2, 0x6072: 2, 0x605A: 2, 0x6007: 2, 0x100
 
 
 class Client:
-    """One drive, and time as it passes."""
+    """A drive with its own time; frames are sent to it one by one."""
 
     def __init__(self, **changes: Any) -> None:
         self.drive = Cia402Drive(plan_of(**changes), 0)
@@ -117,7 +117,7 @@ def test_torque_needs_the_whole_sequence() -> None:
         assert client.motor.torque == 0.0
     client.control(15)
     assert client.state == "OPERATION ENABLED"
-    assert client.motor.torque == 0.0  # what was wanted before is forgotten
+    assert client.motor.torque == 0.0  # the target torque from before is forgotten
     client.target(500)
     assert client.motor.torque == pytest.approx(0.5)
 
@@ -169,7 +169,7 @@ def test_modes(mode: int, follows: bool) -> None:
     assert client.read(0x6061) == mode
     assert bool(client.read(0x6041) & 1 << 12) == (mode == 10)
     client.control(15 | 1 << 8, mode)
-    assert client.motor.torque == pytest.approx(-0.4 if mode == 10 else 0.0)  # halt is of profile torque
+    assert client.motor.torque == pytest.approx(-0.4 if mode == 10 else 0.0)  # only profile torque has the bit halt
     client.control(15, 10 - mode if mode else 10)
     assert client.motor.torque == 0.0  # another mode begins at zero
 
@@ -225,10 +225,10 @@ def test_reported_torque_is_the_mean_since_the_last_sync() -> None:
     client.target(0)
     client.wait(6)
     assert struct.unpack("<ih", client.sync()[0x285])[1] == 400
-    assert struct.unpack("<ih", client.sync()[0x285])[1] == 400  # at the same instant
+    assert struct.unpack("<ih", client.sync()[0x285])[1] == 400  # the mean over no time is the present torque
     client.target(-1000)
     client.wait(5)
-    assert client.read(0x6077, signed=True) == -1000  # SDO tells what it is now, and takes nothing away
+    assert client.read(0x6077, signed=True) == -1000  # SDO reads the present torque and does not end the mean
     client.target(0)
     client.wait(5)
     assert struct.unpack("<ih", client.sync()[0x285])[1] == -500
@@ -289,7 +289,7 @@ def test_a_synchronous_rpdo_waits_for_sync() -> None:
     client.control(7)
     client.control(15)
     client.sync()
-    assert client.motor.torque == 0.0  # what waited was of another time
+    assert client.motor.torque == 0.0  # enabling operation drops an RPDO that waited for SYNC
 
 
 def test_mapping_of_ones_own() -> None:
@@ -317,14 +317,14 @@ def test_mapping_of_ones_own() -> None:
 @pytest.mark.parametrize(
     ("index", "sub", "value", "size", "code"),
     [
-        (0x1400, 1, 0x222, 4, Abort.DEVICE_STATE),  # a valid one must be made invalid first
+        (0x1400, 1, 0x222, 4, Abort.DEVICE_STATE),  # a valid PDO must be made invalid first
         (0x1400, 1, 0x80000000 | 0x585, 4, Abort.VALUE),
         (0x1402, 1, 0x80000000 | 0x800, 4, Abort.VALUE),
         (0x1402, 1, 0x000, 4, Abort.VALUE),
         (0x1800, 2, 241, 1, Abort.VALUE),
         (0x1800, 2, 253, 1, Abort.VALUE),
         (0x1600, 0, 0, 1, Abort.DEVICE_STATE),
-        (0x1603, 1, 0x60410010, 4, Abort.NOT_MAPPABLE),  # nobody may write the statusword
+        (0x1603, 1, 0x60410010, 4, Abort.NOT_MAPPABLE),  # the statusword is read-only
         (0x1A03, 1, 0x10000020, 4, Abort.NOT_MAPPABLE),
         (0x1A03, 1, 0x60410008, 4, Abort.NOT_MAPPABLE),
         (0x1A03, 1, 0x12345678, 4, Abort.NOT_MAPPABLE),
@@ -463,7 +463,7 @@ def test_faults_latch_until_reset_and_begin_at_zero(fault: Fault, code: int, reg
     assert client.drive.refused == {"fault persists": 2}
     client.drive.mend(client.time_ns, 0, fault)
     client.control(0x80)
-    assert client.state == "FAULT"  # no edge
+    assert client.state == "FAULT"  # there is no rising edge
     client.control(0)
     client.control(0x80)
     assert client.state == "SWITCH ON DISABLED"
@@ -537,7 +537,7 @@ def test_a_lost_heartbeat(option: int, state: str) -> None:
     assert client.motor.torque == pytest.approx(0.4 if option == 0 else 0.0)
     client.control(0)
     client.control(0x80)
-    assert client.state == ("FAULT" if option == 1 else "SWITCH ON DISABLED")  # not before it is heard again
+    assert client.state == ("FAULT" if option == 1 else "SWITCH ON DISABLED")  # no reset before the next heartbeat
     client.send(0x77F, b"\x05")
     client.control(0)
     client.control(0x80)
@@ -693,7 +693,7 @@ def test_sync_with_another_identifier() -> None:
 @settings(max_examples=50)
 @given(st.lists(st.floats(0.1, 40), min_size=1, max_size=20))
 def test_events_come_in_the_order_of_their_times(steps: list[float]) -> None:
-    """The same frames whether time passes in steps or at once."""
+    """A drive sends the same frames whether time passes in steps or at once."""
     one, other = Client(), Client()
     for client in (one, other):
         client.write(0x1017, 7)

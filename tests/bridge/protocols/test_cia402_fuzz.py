@@ -1,4 +1,4 @@
-"""A hundred thousand frames of any kind: nothing raises, nothing gives torque that should not, what is refused is counted."""
+"""A hundred thousand random frames: none raises, none gives torque without enabling, and every refused frame is counted."""
 
 import struct
 from random import Random
@@ -18,7 +18,7 @@ NODE = 5
 
 
 def good_frame(random: Random) -> Frame:
-    """One that a host may send."""
+    """Returns a frame that a host may send."""
     match random.randrange(8):
         case 0:
             return Frame(0, bytes((random.choice((1, 1, 1, 2, 128, 129, 130)), random.choice((0, NODE)))))
@@ -44,7 +44,7 @@ def good_frame(random: Random) -> Frame:
 
 
 def mutated(random: Random, frame: Frame) -> Frame:
-    """The frame, or one that differs in length, some bit, identifier or kind."""
+    """Returns the frame, or one with another length, identifier or kind, or with a flipped bit."""
     can_id, data, remote = frame
     match random.randrange(8):
         case 0:
@@ -68,7 +68,7 @@ def test_a_drive(seed: int) -> None:
     for number in range(FRAMES // 2):
         time_ns += random.randrange(3 * MS)
         drive.advance(time_ns)
-        # straight to torque now and then, since few random walks get there
+        # enables the drive now and then, which a random sequence rarely does
         frames = [mutated(random, good_frame(random))]
         if number % 50 == 0:
             way = [Frame(0x205, struct.pack("<Hb", word, 10)) for word in (0, 0x80, 6, 7, 15)]
@@ -89,7 +89,7 @@ def test_a_drive(seed: int) -> None:
             drive.inject(time_ns, 0, fault)
             assert motor.torque == 0.0
             drive.mend(time_ns, 0, fault)
-        if number % 5000 == 0:  # a new one, for its objects are spoiled
+        if number % 5000 == 0:  # a new drive, since random writes have changed its objects
             drive = Cia402Drive(plan_of(), 0)
             motor = drive.motor
     assert enabled > 500
@@ -152,7 +152,7 @@ def test_segments_in_wrong_order_write_nothing() -> None:
     before = dict(drive._od._values)
     for _ in range(20_000):
         command = random.choice((0x00, 0x10, 0x01, 0x11, 0x0E, 0x60, 0x70, 0x80, 0x40, 0x20, 0x21, 0xA0, 0xC0, 0xE0))
-        key = random.choice((0x1008, 0x1000, 0x1018))  # which nobody may write
+        key = random.choice((0x1008, 0x1000, 0x1018))  # read-only objects
         drive.receive(0, Frame(0x605, struct.pack("<BHBI", command, key, random.randrange(3), random.randrange(20))))
     assert drive._od._values == before
     assert drive.refused.total() > 5_000

@@ -39,7 +39,7 @@ def test_torque_is_the_mean_of_the_period_that_ends() -> None:
 
 
 def test_what_drives_are_told() -> None:
-    """Their objects after bring-up, whatever they were before."""
+    """The objects of the drives after bring-up do not depend on their values before."""
     rig = Rig(plan_of(watchdog_ns=50 * MS))
     right = rig.drives[0]
     right.advance(rig.time_ns)
@@ -73,7 +73,7 @@ def test_what_drives_are_told() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_bring_up_survives_lost_frames(seed: int) -> None:
-    """A third of all frames are lost, heartbeats and torques too; watchdogs are long enough for that."""
+    """A third of all frames are lost, heartbeats and torques included; the watchdogs are long enough to bear it."""
     random = Random(seed)
     rig = Rig(plan_of(watchdog_ns=1000 * MS))
     rig.lose = lambda frame: random.random() < 0.33
@@ -118,7 +118,7 @@ def test_a_drive_that_refuses_is_a_fault_and_tried_again_after_its_time() -> Non
     asked: list[int] = []
     rig.listen = lambda time_ns, frame: asked.append(time_ns) if frame.can_id == 0x605 else None
     rig.host.receive(rig.time_ns, Frame(0x585, bytes.fromhex("8017100002000106")))
-    assert not rig.host.fault  # nothing was asked that this answers
+    assert not rig.host.fault  # this answers no request
     frames = rig.host.poll(rig.time_ns)
     request = next(frame.data for frame in frames if frame.can_id == 0x605)
     rig.host.receive(rig.time_ns, Frame(0x585, b"\x80" + request[1:4] + bytes.fromhex("02000106")))
@@ -153,7 +153,7 @@ def test_faults_in_words() -> None:
         rig.drives[wheel].mend(rig.time_ns, wheel, fault)
     rig.cycles(200, 0.5, 0.5)
     assert rig.torques == (0.0, 0.0)
-    assert rig.host.fault  # nothing is done about it without the plan saying so
+    assert rig.host.fault  # without a recovery time in the plan the fault stays
 
 
 def test_a_fault_without_emergency_message_is_one_too() -> None:
@@ -232,7 +232,7 @@ def test_no_drive_is_enabled_in_another_mode() -> None:
     rig = Rig(plan_of())
     words: list[int] = []
     rig.listen = lambda time_ns, frame: words.append(frame.data[0]) if frame.can_id == 0x205 else None
-    rig.lose = lambda frame: frame.can_id in (0x185, 0x205)  # the right drive's part is played here
+    rig.lose = lambda frame: frame.can_id in (0x185, 0x205)  # the test sends the right drive's frames itself
     rig.cycles(42)
     for word, mode, cycles in ((0x40, 4, 1), (0x21, 4, 1), (0x23, 4, 20), (0x23, 10, 1)):
         rig.host.receive(rig.time_ns, Frame(0x185, struct.pack("<Hb", word, mode)))

@@ -1,4 +1,4 @@
-"""The listener to CiA 402 frames, and their DBC."""
+"""The observer of CiA 402 frames, and their DBC."""
 
 import struct
 from collections import Counter
@@ -21,7 +21,7 @@ from support.cia402_rig import PERIOD_NS, Rig, plan_of
 
 
 class Heard:
-    """An observer beside a rig."""
+    """An observer that listens to a rig."""
 
     def __init__(self, **changes: Any) -> None:
         self.rig = Rig(plan_of(**changes))
@@ -33,7 +33,7 @@ class Heard:
         self.findings += self.observer.observe(time_ns, frame)
 
     def kinds(self, *frames: Frame) -> list[str]:
-        """What is found in these frames, now."""
+        """Returns the kinds of the findings in these frames, all sent now."""
         self.findings.clear()
         for frame in frames:
             self.listen(self.rig.time_ns, frame)
@@ -147,7 +147,9 @@ def test_transitions() -> None:
     assert heard.kinds(status(0x40)) == ["transition"]
     assert heard.kinds(control(6), status(0x21), control(7), status(0x23)) == []
     assert heard.kinds(status(0x27)) == ["enabled without command"]
-    assert heard.kinds(status(0x08), status(0x40)) == ["transition"]  # a fault may come at any time, but not go
+    assert heard.kinds(status(0x08), status(0x40)) == [
+        "transition"
+    ]  # a fault may begin at any time, but not end by itself
     assert heard.kinds(status(0x08), control(0), control(0x80), status(0x40)) == []
     assert heard.kinds(control(6), control(7), control(15), status(0x27)) == []
     assert heard.kinds(control(2), status(0x07), status(0x40)) == []
@@ -191,7 +193,7 @@ def test_torque_after_silence() -> None:
     assert heard.kinds(torque(1), torque(0)) == []
     heard.rig.time_ns += 1
     assert heard.kinds(torque(0), torque(1)) == ["torque after silence"]
-    heard = Heard()  # with SYNC, the time it reports of is known
+    heard = Heard()  # with SYNC, the reported time is known
     assert heard.kinds(Frame(0x080), Frame(0x305, b"\0\0"), status(0x27)) == []
     heard.rig.time_ns += 500 * MS
     assert heard.kinds(Frame(0x080), torque(1)) == []
@@ -208,7 +210,7 @@ def test_pdos_of_a_node_that_is_not_operational() -> None:
     heard = Heard()
     assert heard.kinds(Frame(0x705, b"\x7f"), status(0x40), Frame(0x305, b"\0\0")) == ["not operational"] * 2
     assert heard.kinds(Frame(0, b"\x01\0"), status(0x40)) == []
-    assert heard.kinds(Frame(0x705, b"\x7f"), status(0x40)) == []  # it waited for the bus
+    assert heard.kinds(Frame(0x705, b"\x7f"), status(0x40)) == []  # this heartbeat is older than the NMT start
     heard.rig.time_ns += PERIOD_NS
     assert heard.kinds(Frame(0x705, b"\x05"), status(0x40)) == []
     assert heard.kinds(Frame(0x705, b"\x04"), torque(0)) == ["not operational"]

@@ -1,4 +1,4 @@
-"""SDO, held against client and server of the package `canopen`."""
+"""SDO, compared with client and server of the package `canopen`."""
 
 from typing import Any
 
@@ -47,7 +47,7 @@ class Store:
 
 
 def talk(client: SdoClient, server: SdoServer, request: bytes | None) -> list[bytes]:
-    """Carries frames until the transfer is over; returns all of them."""
+    """Passes frames between client and server until the transfer is over; returns all of them."""
     passed = []
     while request is not None:
         answer = server.answer(request)
@@ -96,7 +96,7 @@ def test_there_and_back(data: bytes) -> None:
 
 
 class Wire(canopen.Network):
-    """The package's network; what it sends is kept, or answered by our server at once."""
+    """The package's network.  It keeps the frames that it sends, or has our server answer them at once."""
 
     def __init__(self, server: SdoServer | None = None) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ def test_segments_in_any_order_never_raise_and_are_refused_or_right(requests: li
         assert answer is None or len(answer) == 8
         assert (answer is None) == (request[0] >> 5 == 4)
     assert server.answer(b"") is not None
-    talk(client, server, client.upload(KEY))  # a new transfer begins from anew whatever was before
+    talk(client, server, client.upload(KEY))  # a new transfer works whatever happened before
     assert client.data == store.objects[KEY]
 
 
@@ -179,11 +179,11 @@ def test_a_segment_out_of_turn_ends_the_transfer() -> None:
 def test_length_that_is_not_what_was_said() -> None:
     store = Store()
     server = store.server()
-    server.answer(bytes.fromhex("2145230605000000"))  # 5 bytes are to come
+    server.answer(bytes.fromhex("2145230605000000"))  # announces 5 bytes
     assert abort_code(server.answer(bytes.fromhex("01") + bytes(7)) or b"") == Abort.LENGTH
     server.answer(bytes.fromhex("2145230601000100"))  # 65537
     assert abort_code(server.answer(b"\0" * 8) or b"") == Abort.COMMAND
-    server.answer(bytes.fromhex("2045230600000000"))  # nobody knows how many
+    server.answer(bytes.fromhex("2045230600000000"))  # announces no length
     answers = [server.answer(bytes((number % 2 << 4,)) + bytes(7)) or b"" for number in range(MAX_DOWNLOAD // 7 + 2)]
     assert [abort_code(answer) for answer in answers[-2:]] == [Abort.LENGTH, Abort.COMMAND]
     assert store.objects == {}

@@ -1,4 +1,4 @@
-"""The DBC: read back, and used by cantools as a user would."""
+"""The DBC: read back, and used by the command line of cantools."""
 
 import re
 import subprocess
@@ -88,6 +88,7 @@ def test_names_are_valid_short_and_unique() -> None:
     assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,31}", f"feedback_{name}") for name in names)
 
 
+@pytest.mark.slow
 def test_cantools_decode_shows_newton_metres(tmp_path: Path) -> None:
     dbc = tmp_path / "torque.dbc"
     dbc.write_text(lab_dbc())

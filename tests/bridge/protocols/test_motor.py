@@ -1,4 +1,4 @@
-"""The motor against differential equations solved numerically, and against closed forms of single questions."""
+"""The motor, compared with numerical solutions of its differential equations and with closed-form solutions."""
 
 import math
 from dataclasses import replace
@@ -17,7 +17,7 @@ K_T = MOTOR.torque_constant
 
 
 def pieces(events: list[tuple[float, float]], end: float, plan: MotorPlan) -> list[tuple[float, float, float, float]]:
-    """Where the setpoint goes in straight lines: (from, to, setpoint there, slope), for (time, wanted torque) events."""
+    """Returns the straight pieces of the setpoint, (from, to, setpoint at the start, slope), for events (time, torque)."""
     found, at = [], 0.0
     for (start, wanted), stop in zip(events, [time for time, _ in events[1:]] + [end], strict=True):
         goal = float(np.clip(wanted, -plan.torque_limit, plan.torque_limit))
@@ -35,7 +35,7 @@ def pieces(events: list[tuple[float, float]], end: float, plan: MotorPlan) -> li
 
 
 def solve(events: list[tuple[float, float]], end: float, plan: MotorPlan) -> tuple[float, float, float]:
-    """Shaft torque at the end, ∫τ and ∫τ² over all, by Runge-Kutta from bend to bend."""
+    """Returns the shaft torque at the end, ∫τ and ∫τ², by Runge-Kutta over each straight piece of the setpoint."""
     state = [0.0, 0.0, 0.0]
     for start, stop, setpoint, slope in pieces(events, end, plan):
 
@@ -57,7 +57,7 @@ event_lists = st.lists(
 def test_torque_mean_and_heat_are_those_of_the_differential_equation(
     steps: list[tuple[int, float]], lag: float, slew: float, asked: int
 ) -> None:
-    """Any list of torques; `asked` times in between somebody looks, which must change nothing."""
+    """Any list of torques.  `asked` additional calls of `advance` in between must not change the result."""
     thermal_time = 2.0
     plan = motor_plan(lag=lag, torque_slew=slew, thermal_time=thermal_time, supply_resistance=0.0)
     motor, time_us, events = Motor(plan), 0, []
@@ -71,7 +71,7 @@ def test_torque_mean_and_heat_are_those_of_the_differential_equation(
     torque, area, square = solve(events, time_us * 1e-6, plan)
     assert motor.mean_torque(time_us * 1000) == pytest.approx(area / (time_us * 1e-6), rel=1e-8, abs=1e-9)
     assert motor.torque == pytest.approx(torque, rel=1e-8, abs=1e-9)
-    # zero torque to the next step: its heat must not be lost, and what one step does to the winding is linear in it
+    # zero torque to the next step: the heat of the step must not be lost; the temperature rise is linear in it
     motor.cut(time_us * 1000)
     end_ns = (time_us * 1000 // STEP_NS + 1) * STEP_NS
     motor.advance(end_ns)
@@ -129,7 +129,7 @@ def test_cut_needs_no_ramp() -> None:
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40), st.floats(-1.5, 1.5), st.booleans()), min_size=1, max_size=20))
 def test_means_add_up(calls: list[tuple[int, float, bool]]) -> None:
-    """Means over windows, times their lengths, are the mean over all, whenever they are taken."""
+    """The means over windows, weighted by their lengths, give the mean over the whole time, wherever the windows end."""
     plan = motor_plan(torque_slew=60.0, lag=2e-3)
     one, other, time_ns, total = Motor(plan), Motor(plan), 0, 0.0
     one.advance(0)
@@ -209,7 +209,7 @@ def test_supply_voltage_falls_with_power() -> None:
 
 @pytest.mark.parametrize(("resistance", "volts"), [(2.0, 15.31662479), (3.0, 12.0)])
 def test_brown_out(resistance: float, volts: float) -> None:
-    """The second supply cannot give the power at all."""
+    """The second supply cannot deliver the power at all."""
     motor = Motor(motor_plan(supply_resistance=resistance, brown_out=16.0))
     motor.set_speed(0, 50.5)
     motor.set_torque(0, 1.0)  # 66.5 W: 15.317 V at 2 ohms

@@ -30,7 +30,7 @@ MILLI = NativeCodec(0.001)
 
 
 def torque(robot: int, right: float, left: float, counter: int, **flags: bool) -> Torque:
-    """A command that enables both wheels and says nothing else, but for `flags`."""
+    """Returns a command that enables both wheels, with further `flags`."""
     plain = Torque(robot, right, left, True, True, False, False, False, False, counter)
     return plain._replace(**flags)  # type: ignore[arg-type]
 
@@ -39,7 +39,7 @@ def with_crc(can_id: int, body: bytes) -> bytes:
     return body + bytes([Crc8SaeJ1850.calc(can_id.to_bytes(2, "little") + body)])
 
 
-# (codec, frame, identifier, bytes without CRC): encoded to the bytes, decoded to the frame
+# (codec, frame, identifier, bytes without CRC)
 GOLDEN = [
     (MILLI, torque(3, 1.0, -1.5, 7), 0x103, "e80324fa030700"),
     (MILLI, torque(0, 0.0, 0.0, 0, enable_right=False, enable_left=False), 0x100, "00000000000000"),
@@ -73,7 +73,7 @@ def test_golden_bytes_both_ways(codec: NativeCodec, frame: Torque, can_id: int, 
 
 
 def test_golden_bytes_with_crc() -> None:
-    """As they are on the wire, worked out by hand once."""
+    """The bytes on the wire, computed by hand."""
     data, _ = MILLI.encode(0, 0.0, 0.0, 0, enable=(False, False))
     assert data.hex() == "0000000000000023"
 

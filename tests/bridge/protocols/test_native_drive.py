@@ -1,4 +1,4 @@
-"""The native drive and host: what is special to them; what all protocols share is in tests/conformance."""
+"""The native drive and host: their own properties.  tests/conformance has those of all protocols."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -38,7 +38,7 @@ FINE = (FaultCode.NONE, FaultCode.NONE)
 
 
 class Sender:
-    """Makes commands with a counter of its own."""
+    """Makes commands with consecutive counters."""
 
     def __init__(self) -> None:
         self.counter = 0
@@ -97,7 +97,7 @@ def test_feedback_tells_means_states_and_counts_itself(drive: NativeDrive, send:
     drive.receive(2 * MS, send(1.0, -0.5))
     drive.receive(6 * MS, send(-1.0, 0.5))
     first, second = said(drive.advance(10 * MS)), said(drive.advance(20 * MS))
-    assert first.torques == pytest.approx((0.0, 0.0), abs=1e-9)  # 2 ms none, 4 ms one way, 4 ms the other
+    assert first.torques == pytest.approx((0.0, 0.0), abs=1e-9)  # 2 ms zero, 4 ms forward, 4 ms backward
     assert second.torques == pytest.approx((-1.0, 0.5))
     assert (first.states, first.faults, first.robot) == ((ON, ON), FINE, ROBOT)
     assert (first.counter, second.counter) == (1, 2)
@@ -183,7 +183,7 @@ def test_emergency_stop(drive: NativeDrive, send: Sender) -> None:
 
 
 def bad_frames(good: Frame) -> dict[str, Frame]:
-    """Frames that must be refused, by the reason."""
+    """Returns frames that must be refused, by the reason."""
     body = good.data[:4] + b"\x03" + good.data[5:7]
     never = b"\x00\x80" + body[2:]
     return {
@@ -227,7 +227,9 @@ def test_power_on_takes_any_counter_and_knows_no_fault(drive: NativeDrive, send:
     drive.inject(2 * WATCHDOG_NS, 1, Fault.SILENT)
     drive.mend(2 * WATCHDOG_NS + MS, 0, Fault.SILENT)
     send.counter -= 1
-    assert drive.receive(2 * WATCHDOG_NS + 2 * MS, send()) == []  # the other wheel still keeps it silent
+    assert (
+        drive.receive(2 * WATCHDOG_NS + 2 * MS, send()) == []
+    )  # the fault at the other wheel still silences the drive
     drive.mend(2 * WATCHDOG_NS + 3 * MS, 1, Fault.SILENT)
     send.counter -= 1
     drive.receive(2 * WATCHDOG_NS + 4 * MS, send())
@@ -259,7 +261,7 @@ causes = st.lists(st.tuples(st.integers(0, 39), st.integers(0, 1), st.booleans()
 @settings(max_examples=300, deadline=None)
 @given(steps, causes)
 def test_states_are_those_of_the_table(given_steps: list[Step], given_causes: list[tuple[int, int, bool]]) -> None:
-    """Against the rules written as a table of their own, wheel by wheel."""
+    """Compares the states of each wheel with a second implementation: a table of the rules."""
     drive, sender, time_ms, heard_ms = NativeDrive(PLAN), Sender(), 0, 0
     states, present, wanted = ["off", "off"], [False, False], [0, 0]
     for number, (enable_right, enable_left, right, left, clear, estop, wait_ms) in enumerate(given_steps):
@@ -295,12 +297,12 @@ def test_states_are_those_of_the_table(given_steps: list[Step], given_causes: li
 
 
 def random_frames(seed: int, number: int, own: int, others: tuple[int, ...]) -> Iterator[Frame]:
-    """Frames as chance has them: noise, good ones, good ones with flipped bits, other lengths, other identifiers."""
+    """Yields random frames: noise, valid frames, and valid ones with flipped bits, other lengths or other identifiers."""
     random = np.random.default_rng(seed)
     kinds, data = random.integers(0, 8, number), random.integers(0, 256, (number, 8), dtype=np.uint8)
     for counter, (kind, noise) in enumerate(zip(kinds.tolist(), data, strict=True)):
         body, can_id = bytearray(noise.tobytes()), own
-        if kind > 0:  # all but noise have a right CRC before something happens to them
+        if kind > 0:  # all but noise get a correct CRC before they are changed
             body[5] = counter % 16
             if kind > 1:  # plausible torques; states and faults that exist
                 body[:4] = (0, 0, 0, 0) if kind > 5 else (body[0], body[1] % 4, body[2], 255 - body[3] % 4)
@@ -352,7 +354,7 @@ def test_whatever_comes_the_drive_gives_no_torque_unless_enabled() -> None:
 def test_whatever_comes_the_host_survives_and_counts() -> None:
     host, number = NativeHost(drive_plan("native", recover_ns=50 * MS)), 120_000
     others = (0, 0x103, 0x184, 0x7FF)
-    # every fourth is a status, now and then a healthy drive's feedback
+    # every fourth frame is a status; now and then comes a healthy drive's feedback
     feedback, status = random_frames(3, number, FEEDBACK, others), random_frames(4, number // 4, STATUS, others)
     well = accepted = enabled = 0
     for at in range(number):

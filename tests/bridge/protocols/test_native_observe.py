@@ -1,4 +1,4 @@
-"""The native observer: silent about healthy buses, and a finding for each thing that must not be."""
+"""The native observer: no findings on a healthy bus, and a finding for each violation."""
 
 from math import inf
 
@@ -28,7 +28,7 @@ def with_crc(can_id: int, body: bytes) -> bytes:
 
 
 class Bus:
-    """A bus on which frames are put by hand, with counters that are right."""
+    """A bus with an observer, on which the test puts frames with correct counters."""
 
     def __init__(self) -> None:
         self.observer = NativeObserver(PLAN, ENVELOPE)
@@ -36,7 +36,7 @@ class Bus:
         self.time_ns = 0
 
     def put(self, can_id: int, data: bytes, remote: bool = False) -> list[str]:
-        """Returns the kinds of what is found."""
+        """Puts a frame on the bus; returns the kinds of its findings."""
         found = self.observer.observe(self.time_ns, Frame(can_id, data, remote))
         assert all((finding.time_ns, finding.can_id) == (self.time_ns, can_id) for finding in found)
         assert all(finding.text for finding in found)
@@ -74,7 +74,7 @@ def bus() -> Bus:
 
 
 def findings(rig: Rig) -> list[Finding]:
-    """What is found in all that passed over a rig's bus; of one instant, what drives said came first."""
+    """Returns the findings in all frames of a rig's bus; at the same instant, drives' frames come first."""
     observer = NativeObserver(rig.plan, ENVELOPE)
     frames = sorted(rig.sent + rig.commanded, key=lambda timed: timed[0])
     return [finding for time_ns, frame in frames for finding in observer.observe(time_ns, frame)]
@@ -178,7 +178,7 @@ def test_a_command_that_asks_without_enabling(bus: Bus) -> None:
 
 
 def test_enabling_with_torque(bus: Bus) -> None:
-    assert bus.command(0.5, 0.5) == []  # who knows what was before
+    assert bus.command(0.5, 0.5) == []  # the wheels may have been enabled before the first frame
     assert bus.command(0.5, 0.0, enable=(True, False)) == []
     assert bus.command(0.5, 0.5) == ["enabled with torque"]
     assert bus.command(0.5, 0.5) == []
@@ -188,10 +188,10 @@ def test_enabling_with_torque(bus: Bus) -> None:
 
 
 def test_torque_reported_while_disabled(bus: Bus) -> None:
-    assert bus.feedback(0.5, 0.0, (OFF, OFF)) == []  # it may have been enabled before
+    assert bus.feedback(0.5, 0.0, (OFF, OFF)) == []  # the wheel may have been enabled before
     assert bus.feedback(0.5, 0.0, (OFF, OFF)) == ["torque while disabled"]
     bus.command()
-    assert bus.feedback(0.5, 0.0, (OFF, OFF)) == []  # enabled, and disabled again, since the last one
+    assert bus.feedback(0.5, 0.0, (OFF, OFF)) == []  # the wheel was enabled and disabled again since the last feedback
     assert bus.feedback(0.0, -0.001, (OFF, FAULT), (NONE, FaultCode.WATCHDOG)) == ["torque while disabled"]
     assert bus.feedback(0.0, 0.0, (OFF, FAULT), (NONE, FaultCode.WATCHDOG)) == []
 

@@ -1,4 +1,4 @@
-"""CANSimple bytes, held against the vendor's DBC as the package odrive-can ships it, read by cantools."""
+"""CANSimple bytes, compared with the vendor's DBC in the package odrive-can, as cantools reads it."""
 
 import math
 import re
@@ -25,7 +25,7 @@ from echelon.bridge.protocols.odrive.enums import (
 )
 
 VENDOR: Database = get_dbc()
-AXES = range(8)  # the DBC has as many
+AXES = range(8)  # the axes in the DBC
 
 
 def vendor(command: int, axis: int = 0) -> Message:
@@ -169,7 +169,7 @@ def test_what_is_not_finite_is_neither_sent_nor_taken(bad: float) -> None:
                 message.encode(*values)
             if signal.kind == "f":
                 data = bytearray(8)
-                struct.pack_into("<f", data, 4 * at, bad)  # floats stand first in all of them
+                struct.pack_into("<f", data, 4 * at, bad)  # floats come first in all messages
                 assert message.decode(bytes(data)) is Refusal.NOT_FINITE
 
 

@@ -1,4 +1,4 @@
-"""The virtual ODrive axis, commanded and heard through the vendor's DBC."""
+"""The virtual ODrive axis.  Frames are made and read with the vendor's DBC."""
 
 import math
 import random
@@ -37,7 +37,7 @@ def node(drive: ODriveDrive) -> int:
 
 
 def send(drive: ODriveDrive, time_ns: int, name: str, **values: Any) -> list[Frame]:
-    """Returns what the drive says until then and answers at once."""
+    """Sends a frame; returns the frames that the drive sends up to this instant, and its answer."""
     return drive.advance(time_ns) + drive.receive(time_ns, frame(node(drive), name, **values))
 
 
@@ -52,7 +52,7 @@ def torque(drive: ODriveDrive, time_ns: int, value: float) -> list[Frame]:
 
 
 def heartbeat(drive: ODriveDrive, time_ns: int) -> tuple[str | int, str, str]:
-    """Asks for a heartbeat."""
+    """Asks for a heartbeat; returns error, state and result."""
     drive.advance(time_ns)
     (answer,) = drive.receive(time_ns, request(node(drive), "Heartbeat"))
     values = heard(answer)[2]
@@ -125,7 +125,7 @@ def test_torque_is_zero_until_enabled_and_then_what_is_set() -> None:
     assert last(said, "Get_Torques") == {"Torque_Target": 0.0, "Torque_Estimate": pytest.approx(-0.15, rel=1e-6)}
     assert last(drive.advance(70 * MS), "Get_Torques")["Torque_Estimate"] == 0.0
     assert heartbeat(drive, 70 * MS) == ("NONE", "IDLE", "SUCCESS")
-    enable(drive, 70 * MS)  # what was set before is forgotten
+    enable(drive, 70 * MS)  # the torque from before is forgotten
     assert last(drive.advance(90 * MS), "Get_Torques") == {"Torque_Target": 0.0, "Torque_Estimate": 0.0}
 
 
@@ -189,7 +189,7 @@ def test_watchdog() -> None:
         "Active_Errors": "WATCHDOG_TIMER_EXPIRED",
         "Disarm_Reason": "WATCHDOG_TIMER_EXPIRED",
     }
-    # the cycle in which it expired, noticed at once although time leapt
+    # the watchdog expires at its instant, although a single call covers a longer time
     late = make_drive()
     enable(late, 0)
     torque(late, 33 * MS, 0.5)
@@ -401,7 +401,7 @@ def test_silent() -> None:
     assert drive.receive(10 * MS, request(2, "Heartbeat")) == []
     drive.receive(10 * MS, frame(3, "Estop"))
     assert drive.advance(500 * MS) == []
-    assert drive.refused == {}  # it hears nothing
+    assert drive.refused == {}  # a silent drive receives nothing
     drive.mend(505 * MS, 1, Fault.SILENT)
     said = drive.advance(510 * MS)
     assert last(said, "Get_Torques") == {"Torque_Target": 0.0, "Torque_Estimate": 0.0}
@@ -590,7 +590,7 @@ def test_callers_mistakes() -> None:
 
 
 def must_be_refused(sent: Frame) -> bool:
-    """What the DBC alone says about a frame for axis 2."""
+    """Returns whether axis 2 must refuse a frame, by the DBC alone."""
     axis, command = divmod(sent.can_id, 32)
     if axis == BROADCAST and command in (2, 6, 22, 24):
         axis = 2

@@ -1,4 +1,4 @@
-"""The ODrive host: against virtual axes, and its frames against the vendor's DBC."""
+"""The ODrive host with virtual axes, and its frames compared with the vendor's DBC."""
 
 import math
 import random
@@ -21,7 +21,7 @@ PLAN = drive_plan("odrive", (1, 2))
 
 
 class Robot:
-    """A host with its two drives, run cycle by cycle; what goes either way can be held up."""
+    """A host with its two drives, run cycle by cycle.  Frames can be lost in both directions."""
 
     def __init__(self, start_ns: int = 0, **plan: Any) -> None:
         self.plan = drive_plan("odrive", (1, 2), **plan)
@@ -31,7 +31,7 @@ class Robot:
         self.deaf: set[int] = set()
         """Axes that do not get the host's frames"""
         self.sent: list[Frame] = []
-        """What the host sent in the last cycle"""
+        """Frames of the host in the last cycle"""
 
     def cycle(self, right: float = 0.0, left: float = 0.0) -> None:
         for drive in self.drives:
@@ -96,7 +96,7 @@ def test_bring_up(start_ns: int) -> None:
     robot = Robot(start_ns)
     robot.cycle(0.5, -0.25)
     assert robot.names == [*prepare(1), *prepare(2), *torque_frames(0.0, 0.0)]
-    for _ in range(4):  # by identifier a request would overtake the mode
+    for _ in range(4):  # the request must wait, since its lower identifier would overtake the mode
         robot.cycle(0.5, -0.25)
         assert robot.names == torque_frames(0.0, 0.0)
     robot.cycle(0.5, -0.25)
@@ -105,7 +105,7 @@ def test_bring_up(start_ns: int) -> None:
         assert robot.torques == (0.0, 0.0)
         robot.cycle(0.5, -0.25)
         assert robot.names == torque_frames(0.0, 0.0)
-    # the next heartbeats told, and their cycle sends zeros
+    # the next heartbeats show the new state, and zeros are sent in their cycle
     assert robot.now_ns - PERIOD_NS == ((start_ns + 50 * MS) // (100 * MS) + 1) * 100 * MS
     robot.cycle(0.5, -0.25)
     assert robot.names == torque_frames(0.5, -0.25)
@@ -237,7 +237,7 @@ def test_silence() -> None:
     assert robot.names == torque_frames(0.0, 0.0)
     robot.drives[0].mend(robot.now_ns, 0, Fault.SILENT)
     robot.run(100, 0.5, -0.25)
-    assert (robot.host.fault, robot.torques) == ("right: silent", (0.0, 0.0))  # nobody may start it but `start`
+    assert (robot.host.fault, robot.torques) == ("right: silent", (0.0, 0.0))  # only `start` enables it again
 
 
 def test_an_axis_that_leaves_the_state_unasked() -> None:

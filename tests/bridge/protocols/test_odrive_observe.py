@@ -1,4 +1,4 @@
-"""What a passive listener finds wrong on the bus of a robot with ODrives, and the DBC it is told."""
+"""The observer of a robot with ODrives: its findings; and the DBC of the protocol."""
 
 import math
 import struct
@@ -36,7 +36,7 @@ def kinds(found: list[Finding]) -> list[str]:
 
 
 def observe(observer: ODriveObserver, *frames: tuple[float, Frame]) -> list[str]:
-    """Returns the kinds of all that was found; times in ms."""
+    """Gives frames to an observer; returns the kinds of all findings.  Times are in ms."""
     return [kind for time_ms, frame in frames for kind in kinds(observer.observe(round(time_ms * MS), frame))]
 
 
@@ -50,7 +50,7 @@ def commanded(torque: float, axis: int = 1) -> Frame:
 
 @pytest.mark.parametrize("fault", [None, *LATCHING, Fault.SILENT])
 def test_a_whole_life_has_nothing_wrong(fault: Fault | None) -> None:
-    """Bring-up, torque, a fault, recovery, stop and start."""
+    """There are no findings in bring-up, torque, a fault, recovery, stop and start."""
     drives = [ODriveDrive(PLAN, wheel) for wheel in (0, 1)]
     host, observer = ODriveHost(PLAN), make_observer()
     found: list[Finding] = []
@@ -191,7 +191,7 @@ def test_states(frames: list[tuple[float, Frame]], expected: list[str]) -> None:
         ([(0, IDLE), (10, reported(0.5))], ["torque while idle"]),
         ([(0, IDLE), (10, reported(-2e-6))], ["torque while idle"]),
         ([(0, IDLE), (10, reported(5e-7))], []),
-        ([(0, IDLE), (5, ASK), (20, reported(0.5))], []),  # may be enabled by now
+        ([(0, IDLE), (5, ASK), (20, reported(0.5))], []),  # the axis may be enabled by now
         ([(0, ASK), (1, CLOSED), (50, IDLE), (70, reported(0.5))], ["torque while idle"]),
         ([(0, IDLE), (10, reported(0.5, axis=2))], []),
     ],
@@ -212,7 +212,7 @@ def test_torque_while_idle(frames: list[tuple[float, Frame]], expected: list[str
         ),
         ([(0, commanded(0.5)), (90, commanded(0.5)), (200, reported(0.5))], []),
         ([(0, commanded(0.5)), (90, ASK), (200, reported(0.5))], []),
-        ([(0, request(1, "Get_Iq")), (111, reported(0.5))], ["torque after silence"]),  # nobody ever commanded
+        ([(0, request(1, "Get_Iq")), (111, reported(0.5))], ["torque after silence"]),  # there was never a command
     ],
 )
 def test_torque_after_silence(frames: list[tuple[float, Frame]], expected: list[str]) -> None:
@@ -232,7 +232,7 @@ def test_missing_heartbeats_are_told_once() -> None:
 
 
 def dbc(config: ODriveConfig | None = None) -> Database:
-    """The DBC as a file would have it."""
+    """Returns the DBC, written as text and read back."""
     found = cantools.database.load_string(Database(messages(PLAN, "g1/r3", config)).as_dbc_string(), "dbc")
     assert isinstance(found, Database)
     return found

@@ -1,4 +1,4 @@
-"""A drive protocol in a file beside the scenario: the example runs, and one that is wrong is named in one line."""
+"""A user's drive protocol in a file beside the scenario: the example runs, and a wrong one causes one line that names it."""
 
 import shutil
 from pathlib import Path
@@ -39,7 +39,7 @@ def changed(folder: Path, *changes: tuple[str, str]) -> Path:
 
 
 def failing(method: str, line: str, owner: str = "MyHost(CyclicHost)") -> tuple[str, str]:
-    """Returns the change that makes a method of a host or drive do something else from 0.3 s on."""
+    """Returns the change after which a method of a host or drive executes `line` from 0.3 s on."""
     where = f"class {owner}:"
     (found,) = [row for row in TEXT.splitlines() if row.startswith(where)]
     return found, (
@@ -49,6 +49,7 @@ def failing(method: str, line: str, owner: str = "MyHost(CyclicHost)") -> tuple[
     )
 
 
+@pytest.mark.slow
 def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Path) -> None:
     scenario = folder / "my_drive.toml"
     runs = {}
@@ -65,12 +66,13 @@ def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Pat
     for row in many["can"]["robots"].values():
         assert (row["protocol"], row["enabled"], row["fault"]) == ("my_drive.py:MyProtocol", True, "")
         assert 0.01 < row["largest"] < 1.5
-    # The run's folder has the protocol, too: it can be looked at without the user's.
+    # the run's folder contains the protocol, so the user's folder is not needed to look at the run
     shown = echelon("can", tmp_path / "inprocess", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "r3" in shown.stdout
 
 
+@pytest.mark.slow
 def test_on_a_wall_clock_too(folder: Path, tmp_path: Path) -> None:
     sets = ("--set", "duration=1.0", "--set", "claims=[]", "--set", "can.watchdog=0.5")
     done = echelon("run", folder / "my_drive.toml", "--clock", "wall", *sets, *QUIET, "--out", tmp_path / "run")
@@ -92,6 +94,7 @@ def test_the_dbc_and_the_mirrored_path(folder: Path, tmp_path: Path) -> None:
     assert summary_of(tmp_path / "run")["can"]["referee"]["findings"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["inprocess", "processes"])
 @pytest.mark.parametrize(
     ("change", "says"),
@@ -113,6 +116,7 @@ def test_what_fails_in_a_run_is_one_line_and_wheels_are_stopped_first(
     assert any(says in reason for reason in reasons(summary_of(tmp_path / "run")))
 
 
+@pytest.mark.slow
 def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Path) -> None:
     scenario = changed(folder, failing("command", "raise KeyError('w')"))
     sets = ("--set", "claims=[]", "--set", "can.watchdog=0.5")

@@ -1,4 +1,4 @@
-"""Drive protocols as a plan has them: what a scenario may say, node ids on mixed buses, and the DBC of everything sent."""
+"""Drive protocols in a plan: their choice in a scenario, node ids on mixed buses, and a DBC for every frame."""
 
 import pickle
 import subprocess
@@ -22,7 +22,7 @@ LAB = (SCENARIOS / "lab.toml").read_text()
 
 
 def lab(*overrides: str) -> Plan:
-    """Returns the plan of the lab's nine robots on one bus; files are those of the examples."""
+    """Returns the plan of the lab's nine robots on one bus; file names are relative to the examples."""
     return parse(LAB, "lab", ["can.path=closed", "can.bitrate=1000000", *overrides], EXAMPLES)[1]
 
 
@@ -34,7 +34,7 @@ def refused(*overrides: str) -> str:
 
 
 def drives(number: int, what: str) -> str:
-    """Returns the override that gives a robot's drive, r1 to r9, some keys."""
+    """Returns the override that sets keys of the drive of robot r`number`."""
     return f"formation.groups.g{1 + (number - 1) // 3}.robots.r{number}.drive={{{what}}}"
 
 
@@ -50,7 +50,7 @@ def identifiers(plan: Plan, robot: int) -> frozenset[int]:
 
 
 def check_apart(plan: Plan) -> None:
-    """No two robots on a bus use one identifier, and none uses what a protocol there shares."""
+    """Checks that no two robots on a bus use the same identifier, and none uses a shared one of a protocol there."""
     for one, other in combinations(plan.robots, 2):
         if one.drive.bus == other.drive.bus:
             assert not identifiers(plan, one.index) & identifiers(plan, other.index), (one.name, other.name)
@@ -64,7 +64,7 @@ def test_default_node_ids_never_collide(uses: tuple[str, ...]) -> None:
     plan = lab(*mixed(uses))
     check_apart(plan)
     assert [robot.drive.protocol.use for robot in plan.robots] == list(uses)
-    # What makes frames and hears them uses no other identifiers than planning knows of.
+    # hosts and drives use no other identifiers than planning knows
     places = drive_places(plan)
     for robot in plan.robots:
         own = identifiers(plan, robot.index) | protocol_of(robot).shared_identifiers()
@@ -88,8 +88,8 @@ def test_defaults_move_out_of_the_way_of_what_is_given() -> None:
     plan = lab("robot.drive.protocol=odrive", drives(5, "node_ids=[1,2]"), drives(1, 'protocol="cia402"'))
     check_apart(plan)
     assert plan.robots[4].drive.node_ids == (1, 2)
-    assert plan.robots[0].drive.node_ids == (1, 2)  # of CANopen, which has no identifier of theirs
-    assert plan.robots[1].drive.node_ids == (3, 5)  # 4 would have SYNC
+    assert plan.robots[0].drive.node_ids == (1, 2)  # the CANopen nodes 1 and 2 have no identifier in common with them
+    assert plan.robots[1].drive.node_ids == (3, 5)  # the identifiers of node 4 would include SYNC
 
 
 ODRIVES = "robot.drive.protocol=odrive"
@@ -155,7 +155,7 @@ def test_a_scenario_names_a_protocol_in_three_ways(tmp_path: Path, monkeypatch: 
 
 
 def test_a_level_that_names_a_protocol_takes_no_parameters_from_above(tmp_path: Path) -> None:
-    """A protocol is inherited as a whole; the rest of the drive's table key by key."""
+    """A protocol is inherited with its parameters as a whole; the other keys of the table `drive` are inherited one by one."""
     text = (EXAMPLES / "my_drive.py").read_text().replace("    wheels =", "    offset: int = 0\n    wheels =")
     (tmp_path / "p.py").write_text(text)
     (tmp_path / "lab.toml").write_text(LAB)
@@ -169,7 +169,7 @@ def test_a_level_that_names_a_protocol_takes_no_parameters_from_above(tmp_path: 
 
 
 def test_a_process_that_gets_a_plan_imports_no_more_of_protocols_than_their_classes(tmp_path: Path) -> None:
-    """A robot's process needs neither hosts nor drives, and cantools takes a quarter of a second."""
+    """A robot's process needs no hosts and drives, and the import of cantools would take a quarter of a second."""
     (tmp_path / "plan").write_bytes(pickle.dumps(plan_of("drives")))
     code = f"import pickle, sys; pickle.load(open({str(tmp_path / 'plan')!r}, 'rb')); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
@@ -183,9 +183,10 @@ def test_a_process_that_gets_a_plan_imports_no_more_of_protocols_than_their_clas
     assert not modules & {"cantools", "can", "zenoh"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("uses", [*permutations(PROTOCOLS)][::2])
 def test_all_protocols_on_one_bus_by_default(uses: tuple[str, ...], tmp_path: Path) -> None:
-    """Nine robots, closed: the referee finds nothing, and cantools knows every frame."""
+    """Nine robots on the closed path: the referee finds nothing, and the DBC describes every frame."""
     overrides = [f"formation.groups.g{at}.robot.drive.protocol={use}" for at, use in enumerate(uses, start=1)]
     overrides += ["can.path=closed", "can.bitrate=1000000", "duration=1", "claims=[]"]
     sets = [argument for override in overrides for argument in ("--set", override)]

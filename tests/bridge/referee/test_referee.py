@@ -1,4 +1,4 @@
-"""The referee: nothing is found in what our own runs put on the bus, and each broken contract is."""
+"""The referee: it finds nothing in our own runs, and it finds each violation that is put into their frames."""
 
 import struct
 from collections.abc import Callable
@@ -35,14 +35,14 @@ IDENTIFIERS = {
 }
 COMMAND_IDS = {"native": (0x100,), "odrive": (0x2E, 0x4E), "cia402": (0x301, 0x302)}
 REPORT_IDS = {"native": (0x180,), "odrive": (0x3C, 0x5C), "cia402": (0x281, 0x282)}
-"""Of robot 0"""
+"""Identifiers of the torque reports of robot 0"""
 many = settings(max_examples=12, deadline=None)
 each_protocol = pytest.mark.parametrize("protocol", PROTOCOLS)
 
 
 @cache
 def run(protocol: str, *overrides: str) -> tuple[Plan, tuple[Heard, ...]]:
-    """Returns the plan of a short closed run, and all that its buses carried."""
+    """Returns the plan of a short closed run, and all frames that its buses carried."""
     plan = plan_of(
         "lab",
         "can.path=closed",
@@ -73,7 +73,7 @@ def judged(plan: Plan, frames: list[Heard] | tuple[Heard, ...]) -> Referee:
 
 @cache
 def cyclic(protocol: str) -> list[int]:
-    """Where in a run frames are that must come regularly, but for its last 0.3 s."""
+    """Returns the positions of the cyclic frames in a run, without its last 0.3 s."""
     plan, frames = run(protocol)
     can_ids = {can_id for observer in Referee(plan).observers for can_id in observer.cyclic}
     return [at for at, (time_ns, _, frame) in enumerate(frames) if 0 <= time_ns < 700 * MS and frame.can_id in can_ids]
@@ -82,7 +82,7 @@ def cyclic(protocol: str) -> list[int]:
 def changed(
     frames: tuple[Heard, ...], where: Callable[[int, int], bool], data: Callable[[bytes], bytes]
 ) -> list[Heard]:
-    """Returns frames with other data where (time, identifier) says so."""
+    """Returns the frames with changed data where `where`(time, identifier) is true."""
     return [
         (time_ns, bus, frame._replace(data=data(frame.data)) if where(time_ns, frame.can_id) else frame)
         for time_ns, bus, frame in frames
@@ -90,7 +90,7 @@ def changed(
 
 
 def with_crc(can_id: int, body: bytes) -> bytes:
-    """A native frame of seven bytes and the CRC of a third party."""
+    """Returns the data of a native frame: seven bytes and their CRC by the package crccheck."""
     return body + bytes([Crc8SaeJ1850.calc(can_id.to_bytes(2, "little") + body)])
 
 
@@ -151,7 +151,7 @@ def test_a_frame_that_is_missing(protocol: str, data: st.DataObject) -> None:
     referee = judged(plan, frames[:at] + frames[at + 1 :])
     assert referee.kinds["gap"] >= 1
     assert {row.id for row in referee.kept if row.kind == "gap"} == {f"{frames[at][2].can_id:03X}"}
-    # without the largest command there is a report that nobody asked for
+    # if the largest command is missing, the torque that it caused was not commanded
     assert set(referee.kinds) <= {"gap", "counter gap", "heartbeat missing", "torque not commanded"}
 
 
@@ -203,7 +203,7 @@ def test_a_bit_that_flipped_in_a_native_frame(data: st.DataObject) -> None:
 def test_a_bit_that_flipped_where_nothing_but_the_value_tells(
     protocol: str, byte: int, bit: int, data: st.DataObject
 ) -> None:
-    """The bus itself has a CRC; these protocols have none of their own."""
+    """These protocols have no CRC of their own, so only a check of the values can find a flipped bit."""
     plan, frames = run(protocol)
     can_ids = COMMAND_IDS[protocol]
     at = data.draw(st.sampled_from([at for at in cyclic(protocol) if frames[at][2].can_id in can_ids]))
@@ -235,7 +235,7 @@ def test_torques_that_are_too_far_apart_within_the_window(protocol: str) -> None
     plan, frames = run(protocol)
     robot = plan.robots[0]
     observer = Referee(plan).robots[0].observer
-    said = []  # what the right wheel was asked for, without what begins the window anew
+    said = []  # the commands to the right wheel
     for time_ns, _, frame in frames:
         if frame.can_id == COMMAND_IDS[protocol][0] and time_ns > 0:
             observer.observe(time_ns, frame)
@@ -331,7 +331,7 @@ def test_frames_of_others_are_counted_and_not_judged(protocol: str) -> None:
 
 
 def native(plan: Plan, robot: int, times_ns: list[int]) -> list[Heard]:
-    """Commands of one robot for no torque, at these times."""
+    """Returns commands of zero torque to one robot, at these times."""
     return [
         (time_ns, 0, Frame(0x100 + robot, with_crc(0x100 + robot, bytes((0, 0, 0, 0, 3, number % 16, 0)))))
         for number, time_ns in enumerate(times_ns)
@@ -340,7 +340,7 @@ def native(plan: Plan, robot: int, times_ns: list[int]) -> list[Heard]:
 
 @pytest.fixture
 def mirror() -> Plan:
-    """One robot's torques, every 10 ms at 500 kbit/s."""
+    """A plan with a mirrored path: one robot's torques, every 10 ms at 500 kbit/s."""
     plan = plan_of("lab", "can.bitrate=500000")
     return replace(plan, robots=plan.robots[:1])
 
@@ -365,7 +365,7 @@ def test_waiting_for_a_full_bus_is_not_being_late(mirror: Plan) -> None:
     times = [at * 10 * MS for at in range(10)]
     times[5] += 8 * MS
     frames = native(mirror, 0, times)
-    # frames of eight bytes take 222 to 270 us: a stretch that begins before the frame is due, and lasts until it comes
+    # frames of eight bytes take 222 to 270 µs: a busy stretch from before the frame is due until it comes
     full = [(49 * MS + 250_000 * at, 0, Frame(0x010, bytes(8))) for at in range(36)]
     assert kinds_of(mirror, frames + full) == {}
     free_again = [heard for heard in full if not 50 * MS < heard[0] < 57 * MS]

@@ -1,4 +1,4 @@
-"""The closed torque path in one process: what reaches the plant is what the drives decoded, and nothing else."""
+"""The closed torque path in one process: the plant gets exactly the torques that the drives decoded."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -43,7 +43,7 @@ def stations(engine: Engine) -> tuple[Commander, DriveBank]:
 
 
 class Heard:
-    """Keeps what robots wanted, and what their wheels got, by time: arrays (robots, 2)."""
+    """Collects the torques that robots wanted and that their wheels got, by time: arrays (robots, 2)."""
 
     def __init__(self) -> None:
         self.wanted: dict[int, dict[int, Any]] = {}
@@ -60,7 +60,7 @@ class Heard:
 
 
 def errors(heard: Heard) -> Any:
-    """Returns how far the wheels' torques of each period are from what was wanted at its beginning."""
+    """Returns the difference between the wheels' torques of each period and those wanted at its beginning."""
     rows = []
     for time_ns, wanted in heard.wanted.items():
         got = heard.got.get(time_ns + PERIOD)
@@ -70,7 +70,7 @@ def errors(heard: Heard) -> Any:
 
 
 class RoundedLimits:
-    """A robot's torque limits that round to what a native frame can say: the other way to get there."""
+    """Torque limits of a robot that also round to the resolution of a native frame: a second way to the same torques."""
 
     def __init__(self, limits: Any) -> None:
         self._limits = limits
@@ -111,12 +111,12 @@ def test_wheels_get_what_was_wanted_within_quantisation(protocol: str, step: flo
 
 
 def test_the_bus_takes_time_and_the_wheels_see_it() -> None:
-    """At 500 kbit/s a command arrives after the frames before it: the mean of a period has a part of the old torque."""
+    """At 500 kbit/s a command arrives after the frames before it, so the mean of a period contains the old torque."""
     heard = Heard()
     ran(closed(), heard)
     late = errors(heard)
     assert late.max() > 2 * SCALE
-    # Frame k of nine ends after k + 1 frame times of 0.24 to 0.25 ms, and in the first the bus may have been busy.
+    # frame k of nine ends after k + 1 frame times of 0.24 to 0.25 ms; at the first the bus may have been busy
     for robot in range(9):
         for time_ns in range(10 * PERIOD, 100 * PERIOD, PERIOD):
             share = (robot + 1.5) * 0.26e6 / PERIOD
@@ -159,7 +159,7 @@ def test_whoever_dies_wheel_torque_is_zero_within_the_watchdog_time_plus_one_fra
                 engine._receivers.pop((index, channel), None)
         if time_ns > dies_ns + plan.can.watchdog_ns + PERIOD:
             assert all(torque_of(robot) == 0 for robot in hit)
-    # It was held until then, and not taken away by chance.
+    # the torque was held until then
     assert np.abs(heard.got[dies_ns + plan.can.watchdog_ns // 2][hit]).max() > 0
     if dead != "bridge":
         assert all(bridge.robots[robot].stopped[NOT_COMMANDED] > 0 for robot in hit)
@@ -197,7 +197,7 @@ def test_a_drive_with_a_fault_gives_no_torque_until_it_is_cleared_and_enabled(pr
         engine = ran(closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", event, *more), heard)
         first = {time_ns: np.abs(row[0]).max() for time_ns, row in heard.got.items()}
         assert first[500 * MS] > 0
-        # Of the period that begins at the fault, the torque before the next command may still be there.
+        # the period that begins at the fault may still contain torque from before the next command
         assert all(tau == 0 for time_ns, tau in first.items() if 530 * MS <= time_ns <= 800 * MS)
         later = [tau for time_ns, tau in first.items() if time_ns > 1500 * MS]
         assert bool(max(later) > 0) is recover
@@ -225,7 +225,7 @@ ESTOPS = {
     "odrive": [(node << 5 | 2, lambda data: True) for node in range(1, 7)],
     "cia402": [(0x200 + node, lambda data: data[:2] == b"\x02\x00") for node in range(1, 7)],
 }
-"""Identifiers of g1's e-stops, and what makes a frame one"""
+"""By protocol: the identifiers of the e-stops of g1, and a function that recognises one"""
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -262,7 +262,7 @@ def test_estops_that_overlap_and_short_ones(events: str, stopped: tuple[int, int
     if until_ms < 2000:
         assert any(tau for at, tau in first.items() if at > until_ms + 50)
     if until_ms == 520:
-        assert first[530] == 0  # it did happen
+        assert first[530] == 0  # the fault did happen
 
 
 def test_a_fault_that_two_events_cause_stays_until_both_are_over() -> None:
@@ -277,7 +277,7 @@ def test_a_fault_that_two_events_cause_stays_until_both_are_over() -> None:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_limits_of_the_envelope_count_from_the_zero_that_comes_first_after_a_fault(protocol: str) -> None:
-    """A robot that wants more than the rise limit when its drives come back must not get it in one step."""
+    """A robot that wants more than `rise_limit` when its drives recover must not get it in one step."""
     heard = Heard()
     engine = ran(
         closed(
@@ -349,7 +349,7 @@ def test_disturbed_frames_are_sent_again_and_a_controller_that_is_off_comes_back
     from_bridge = sorted(timed.time_ns for source, timed in heard.frames if timed.node == BRIDGE_NODE)
     gap = np.diff(from_bridge).max()
     assert 100 * MS < gap < 125 * MS  # can.restart, 128 times 11 idle bits, and the way to the next period
-    # What waited meanwhile is lost and does not come late.
+    # frames that waited meanwhile are lost and do not come late
     assert all(bus.traffic[0x100 + robot].latency_max_ns < 2 * PERIOD for robot in range(9))
     assert bus.traffic[0x100].lost > 8
     assert heard.got[1900 * MS].any(axis=1).all()  # all were enabled again
@@ -357,7 +357,7 @@ def test_disturbed_frames_are_sent_again_and_a_controller_that_is_off_comes_back
 
 @pytest.mark.parametrize("kind", ["error_frames", "bus_off"])
 def test_one_disturbance_does_not_swing_on(kind: str) -> None:
-    """A SYNC that comes late must not make all later ones late."""
+    """A late SYNC must not make all later ones late."""
     more = ", rate=0.5, duration=0.02" if kind == "error_frames" else ""
     engine = ran(
         closed(
@@ -386,7 +386,7 @@ def test_a_drive_that_is_off_the_bus_comes_back_with_news_only() -> None:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_drives_come_up_at_once_where_the_lower_identifier_goes_first(protocol: str) -> None:
-    """Nothing is refused, and all are enabled long before the run: no request overtakes what must come before it."""
+    """No frame is refused, and all drives are enabled long before the run: no request overtakes the frame before it."""
     plan = closed(f"robot.drive.protocol={protocol}", "can.bitrate=1000000", "can.bring_up=0.5", duration=0.1)
     engine = Engine(plan)
     bridge, drives = stations(engine)
@@ -397,7 +397,7 @@ def test_drives_come_up_at_once_where_the_lower_identifier_goes_first(protocol: 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_drive_that_is_off_the_bus_hears_nothing_and_is_not_heard(protocol: str) -> None:
-    """It takes the torque away by itself after the watchdog's time; and the bridge knows nothing of it until it is back."""
+    """A drive that is bus-off takes the torque away after its watchdog; the bridge gets nothing from it until it is back."""
     event = 'events=[{kind="bus_off", at=0.505, robot="g1/r1"}]'
     bitrate = "can.bitrate=1000000"  # it goes off at the next torque period: 0.51 s
     heard = Heard()

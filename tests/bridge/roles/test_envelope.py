@@ -1,6 +1,6 @@
-"""The envelope: every limit at its boundary, and against a slow gate that keeps all it ever sent.
+"""The envelope: every limit at its boundary, and a comparison with a slow gate that keeps all torques it ever sent.
 
-Each check takes the module, so that it can be held against mutants as well (test_envelope_mutations.py)."""
+Each check takes the module as an argument, so that it can also run with mutants (test_envelope_mutations.py)."""
 
 import math
 from collections.abc import Callable
@@ -28,7 +28,7 @@ limits = st.one_of(st.just(INF), st.integers(0, 40).map(lambda n: n / 8))
 
 
 class Gates(RuleBasedStateMachine):
-    """Any commands at any times: the gate does what the slow one does."""
+    """Gives any commands at any times to both gates; their results must be equal."""
 
     @initialize(plan=st.builds(EnvelopePlan, limits, limits, limits, limits, st.integers(0, 5)), now=st.integers())
     def build(self, plan: EnvelopePlan, now: int) -> None:

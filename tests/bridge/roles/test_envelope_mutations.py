@@ -1,6 +1,6 @@
-"""The checks of the envelope notice every small mistake: each mutant of the module fails one of them.
+"""The checks of the envelope find every small mistake: each mutant of the module fails one of them.
 
-A mutant has one comparison, operator, literal, condition, min or max changed, or one statement left out."""
+In a mutant, one comparison, operator, literal, condition, min or max is changed, or one statement is missing."""
 
 import ast
 import copy
@@ -33,9 +33,9 @@ OPPOSITES: dict[type[ast.AST], type[ast.AST]] = {
 }
 CALLS = {"min": "max", "max": "min", "popleft": "pop", "pop": "popleft"}
 
-# What changes nothing, as (line, line of the mutant): of two equal values the window may keep both or only the later.
-# With both, the earlier one stands in front and leaves first; the later one, then in front, is the same value.
-# And a torque of zero has nothing in common with any other, whatever its sign is taken for.
+# Equivalent mutants, as (line, line of the mutant).  Of two equal values the window may keep both or only the later one: if it
+# keeps both, the earlier one leaves first, and the later one has the same value.  A torque of zero has no common part with any
+# other torque, whichever sign it counts for.
 COMMON = "common = min(size, before) if (torque {} 0.0) is (sent {} 0.0) else 0.0"
 EQUIVALENT = {
     ("while window and window[-1][1] <= value:", "while window and window[-1][1] < value:"),
@@ -45,7 +45,7 @@ EQUIVALENT = {
 
 
 def changes(node: ast.AST) -> Iterator[ast.AST]:
-    """What may stand in place of a node."""
+    """Yields the nodes that may replace a node."""
     if isinstance(node, ast.Compare):
         (operator,) = node.ops
         others = [other for other in ORDERS if not isinstance(operator, other)] if isinstance(operator, ORDERS) else []
@@ -86,7 +86,7 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
         yield type(node)(ast.UnaryOp(ast.Not(), node.test), node.body, node.orelse)
         yield ast.Pass()
     elif isinstance(node, ast.Return) and isinstance(node.value, ast.Constant) and node.value.value is None:
-        return  # as it would anyway
+        return  # at the end of a function this changes nothing
     elif isinstance(node, ast.Return | ast.Assign | ast.Raise) or (
         isinstance(node, ast.Expr) and not isinstance(node.value, ast.Constant)
     ):
@@ -104,7 +104,7 @@ class Replace(ast.NodeTransformer):
 
 
 def mutants() -> dict[str, str]:
-    """The text of each mutant, and what differs in words."""
+    """Returns the source of each mutant, with the change in words."""
     found = {}
     original = ast.unparse(ast.parse(SOURCE))
     lines = original.splitlines()
@@ -126,7 +126,7 @@ def mutants() -> dict[str, str]:
 
 
 def survives(source: str) -> bool:
-    """True if no check notices."""
+    """Returns whether all checks pass with this source."""
     module = ModuleType("echelon.bridge.roles.envelope")
 
     def interrupt(number: int, frame: FrameType | None) -> None:

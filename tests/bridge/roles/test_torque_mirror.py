@@ -1,4 +1,4 @@
-"""The bridge: one frame per robot and period, and never torque that nobody commanded."""
+"""The torque mirror: one frame per robot and period, and never a torque that was not commanded."""
 
 import math
 

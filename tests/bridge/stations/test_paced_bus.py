@@ -1,4 +1,4 @@
-"""Buses on a wall clock that are as slow as real ones: several models that hear each other share one bus."""
+"""Paced buses on a wall clock: several models that hear each other are together only as fast as one real bus."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.stations.paced_bus import PacedBus
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.bus_model import BusEventKind
 from echelon.bridge.timing.ideal_bus import IdealBus
@@ -20,7 +20,7 @@ OLD = 100_000_000
 
 
 class Port:
-    """Where frames would go out."""
+    """Stands for the bus: keeps the frames that go out."""
 
     def __init__(self, takes: bool = True) -> None:
         self.sent: list[Frame] = []
@@ -32,7 +32,7 @@ class Port:
 
 
 def paced(**options: Any) -> PacedBus:
-    return PacedBus(Port(), BusTime(500_000, **options), OLD)  # type: ignore[arg-type]
+    return PacedBus(Port(), ArbitratedBus(500_000, **options), OLD)  # type: ignore[arg-type]
 
 
 def bits(frame: Frame) -> int:
@@ -42,7 +42,7 @@ def bits(frame: Frame) -> int:
 def play(
     script: Sequence[tuple[int, int, Frame]], models: Sequence[PacedBus], late_ns: int
 ) -> list[tuple[int, int, Frame]]:
-    """Plays (time, model, frame) to models that hear each other a bit late; returns what went out, and when."""
+    """Sends (time, model, frame) by models that hear each other `late_ns` late; returns when each frame went out."""
     todo, heard, out = sorted(script, key=lambda item: item[0]), [], []
     while True:
         times = [due for model in models if (due := model.due_ns) is not None]
@@ -77,7 +77,7 @@ def test_together_they_send_no_more_than_the_bit_rate_allows(
     assert sorted(frame for _, _, frame in out) == sorted(frame for _, _, frame in script)  # once each
     for number, model in enumerate(models):
         assert [frame for _, of, frame in out if of == number] == model.bus.sent  # type: ignore[attr-defined]
-    # Frames that began before any was heard of may be too many, one of each; what is then sent waits for all of them.
+    # frames that begin before the models hear of each other may overlap, one of each model; later frames wait for all of them
     for first in range(len(out)):
         taken_ns = 0
         for time_ns, _, frame in out[first + 1 :]:
@@ -87,7 +87,7 @@ def test_together_they_send_no_more_than_the_bit_rate_allows(
 
 
 def test_alone_it_is_the_model_that_it_has() -> None:
-    one, model = paced(), BusTime(500_000)
+    one, model = paced(), ArbitratedBus(500_000)
     script = [(7_000 * at, 0, Frame(0x100 + at * 37 % 11, bytes(at % 9))) for at in range(50)]
     out = play(script, [one], 0)
     for at, node, frame in script:
@@ -96,7 +96,7 @@ def test_alone_it_is_the_model_that_it_has() -> None:
 
 
 def test_an_idle_bus_was_taken_before_a_frame_was_heard() -> None:
-    """So what is sent next waits for three bits, and not for all of it once more."""
+    """So the next frame waits for three bits only, not for the length of the heard frame."""
     one, theirs, mine = paced(), Frame(0x200, bytes(8)), Frame(0x300, b"\x01")
     one.hear(1_000_000, theirs, 1_000_000)
     one.send(1_000_000, 0, mine)
@@ -105,7 +105,7 @@ def test_an_idle_bus_was_taken_before_a_frame_was_heard() -> None:
 
 
 def test_the_lower_identifier_goes_first() -> None:
-    """Whoever floods with urgent frames keeps the bus; others get what is left, and lose nothing."""
+    """A node that floods the bus with urgent frames keeps it; the others get the rest and lose nothing."""
     urgent, other = paced(), paced()
     script = [(at, 0, Frame(0x080, bytes([at % 256] * 8))) for at in range(40)]
     script += [(at, 1, Frame(0x700, bytes([at % 256] * 8))) for at in range(5)]
@@ -158,7 +158,7 @@ def test_a_controller_that_is_off_takes_nothing_and_comes_back_while_others_talk
 
 
 def test_what_waited_when_a_controller_went_off_is_lost() -> None:
-    """It would be old when it is back, also if nothing is sent meanwhile."""
+    """Frames that waited would be old when the controller is back, even if nothing is sent meanwhile."""
     one = paced(restart_ns=OLD)
     for _ in range(5):
         one.send(0, 0, Frame(0x100))
@@ -204,7 +204,7 @@ def test_good_frames_of_others_take_errors_back() -> None:
 
 
 def test_what_the_bus_did_not_take_was_not_sent() -> None:
-    one = PacedBus(Port(takes=False), BusTime(500_000), OLD)  # type: ignore[arg-type]
+    one = PacedBus(Port(takes=False), ArbitratedBus(500_000), OLD)  # type: ignore[arg-type]
     one.send(0, 0, Frame(0x100))
     assert one.run(LONGEST) == []
 

@@ -1,4 +1,4 @@
-"""In virtual time nothing is used that the bus did not carry: what a station hears must have come, bit for bit."""
+"""The time rail: in virtual time a station uses only frames that the bus really carried, bit for bit."""
 
 import threading
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ def message(frames: list[TimedFrame]) -> Message:
 
 
 def station(rail: Rail, is_bridge: bool, says: list[TimedFrame], heard: list[Heard]) -> Stage:
-    """A stage that notes what it hears and says frames, on a rail."""
+    """Returns a stage on a rail that keeps the messages it gets and sends the frames `says`."""
 
     def run(time_ns: int, messages: object) -> tuple[Message, ...]:
         heard.extend(messages)  # type: ignore[arg-type]

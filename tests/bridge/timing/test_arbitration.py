@@ -1,4 +1,4 @@
-"""The bus in time, against a slow bus that is simulated bit by bit, and by hand."""
+"""The model of a bus, compared with a slow simulation bit by bit, and with results computed by hand."""
 
 import hashlib
 from collections import Counter, deque
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.random import Philox
 
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.bus_model import BusEvent, BusEventKind, BusModel, Delivered
 from echelon.bridge.timing.ideal_bus import IdealBus
@@ -21,7 +21,7 @@ BIT = 1_000  # ns at 1 Mbit/s
 
 
 def on_wire(frame: Frame) -> str:
-    """A frame as levels, from start to end of frame: CRC by long division, stuffing by looking back."""
+    """Returns a frame as levels from start to end: CRC by long division, stuffing by looking back five bits."""
     bits = f"0{frame.can_id:011b}{frame.remote:b}00{len(frame.data):04b}" + "".join(f"{n:08b}" for n in frame.data)
     remainder = int(bits, 2) << 15
     while remainder.bit_length() > 15:
@@ -56,7 +56,7 @@ class SlowNode:
 
 
 class SlowBus:
-    """One bit after the other: nodes that see the bus free start together, and withdraw where their 1 is a 0."""
+    """A bus simulated bit by bit: nodes that see it free start together, and a node stops where its 1 is overwritten by a 0."""
 
     def __init__(self, seed: int, number: int, capacity: int, restart_bits: int) -> None:
         self.key = key(seed, number)
@@ -128,7 +128,7 @@ class SlowBus:
         self.busy += len(levels) + 3
 
     def step(self) -> None:
-        """One bit."""
+        """Simulates one bit."""
         if not self.levels:
             self.start()
         level = self.levels.popleft() if self.levels else 1
@@ -190,8 +190,8 @@ Script = list[tuple[int, tuple[int, Frame] | int | float | None]]  # gap; send, 
 
 
 def compare(script: Script, capacity: int, restart_bits: int, rest_bits: int) -> SlowBus:
-    """Plays a script on both buses; everything must agree."""
-    fast = BusTime(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT, note_errors=True)
+    """Runs a script on both buses; all results must agree."""
+    fast = ArbitratedBus(MEGA, 7, 2, capacity=capacity, restart_ns=restart_bits * BIT, note_errors=True)
     slow = SlowBus(7, 2, capacity, restart_bits)
     delivered: list[Delivered] = fast.run(0)
     for gap, action in [*script, (rest_bits, None)]:
@@ -280,14 +280,14 @@ def bits(frame: Frame) -> int:
 
 
 def test_by_hand() -> None:
-    bus = BusTime(500_000)
+    bus = ArbitratedBus(500_000)
     assert (bus.due_ns, bus.busy_ns, bus.load) == (None, 0, 0.0)
     bus.run(-5_000)
     assert bus.load == 0.0
     assert bus.send(-5_000, 3, C)
     assert bus.due_ns == -5_000 + (bits(C) - 3) * 2_000
     assert bus.send(-5_000, 1, B)  # at the same instant, and more important
-    assert bus.send(-4_999, 2, A)  # too late: B is on its way
+    assert bus.send(-4_999, 2, A)  # too late: B has started
     ends = [
         -5_000 + 2_000 * (bits(B) - 3),
         -5_000 + 2_000 * (bits(B) + bits(A) - 3),
@@ -308,14 +308,14 @@ def test_by_hand() -> None:
 
 
 def test_data_comes_before_remote() -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     bus.send(0, 1, Frame(5, remote=True))
     bus.send(0, 2, Frame(5, b"x"))
     assert [sent.frame.remote for sent in bus.run(MEGA)] == [False, True]
 
 
 def test_three_bits_between_frames_are_time_enough_to_answer() -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     bus.send(0, 1, A)
     bus.send(0, 1, C)
     (first,) = bus.run(bits(A) * BIT - 3 * BIT)
@@ -324,7 +324,7 @@ def test_three_bits_between_frames_are_time_enough_to_answer() -> None:
 
 
 def test_a_full_queue_loses_and_one_that_empties_takes_again() -> None:
-    bus = BusTime(MEGA, capacity=2)
+    bus = ArbitratedBus(MEGA, capacity=2)
     assert [bus.send(0, 1, A), bus.send(0, 1, B), bus.send(0, 1, C), bus.send(0, 2, C)] == [True, True, False, True]
     end_ns = (bits(A) - 3) * BIT
     assert not bus.send(end_ns - 1, 1, C)
@@ -335,7 +335,7 @@ def test_a_full_queue_loses_and_one_that_empties_takes_again() -> None:
 @given(st.integers(1, 2_000_000), frames())
 def test_a_frame_takes_its_bits_at_any_bit_rate(bitrate: int, sent: tuple[int, Frame]) -> None:
     node, frame = sent
-    bus = BusTime(bitrate)
+    bus = ArbitratedBus(bitrate)
     bus.send(11, node, frame)
     due_ns = bus.due_ns
     assert due_ns is not None
@@ -352,7 +352,7 @@ def run_to(bus: BusModel, due_ns: int) -> list[Delivered]:
 
 
 def play(bus: BusModel, script: list[tuple[int, tuple[int, Frame]]], step: bool) -> list[Delivered]:
-    """Sends and runs: in one go from send to send, or from one `due_ns` to the next."""
+    """Sends the frames of a script; runs the bus from send to send, or, with `step`, from one `due_ns` to the next."""
     delivered, now = [], 0
     for gap, (node, frame) in script:
         now += gap * BIT + gap % 7
@@ -366,13 +366,13 @@ def play(bus: BusModel, script: list[tuple[int, tuple[int, Frame]]], step: bool)
 
 @given(st.lists(st.tuples(gaps, frames()), max_size=30), st.sampled_from([0.0, 0.5]))
 def test_from_one_due_instant_to_the_next_is_the_same(script: list[tuple[int, tuple[int, Frame]]], rate: float) -> None:
-    once = play(BusTime(MEGA, 1, error_rate=rate), script, step=False)
-    assert play(BusTime(MEGA, 1, error_rate=rate), script, step=True) == once
+    once = play(ArbitratedBus(MEGA, 1, error_rate=rate), script, step=False)
+    assert play(ArbitratedBus(MEGA, 1, error_rate=rate), script, step=True) == once
     assert len(once) == len(script)
 
 
 def test_a_bus_that_is_only_waiting_for_a_node_to_come_back_is_due_by_then() -> None:
-    bus = BusTime(MEGA, restart_ns=5_000)
+    bus = ArbitratedBus(MEGA, restart_ns=5_000)
     bus.run(100)
     bus.bus_off(1)
     bus.bus_off(1)
@@ -389,7 +389,7 @@ def test_a_bus_that_is_only_waiting_for_a_node_to_come_back_is_due_by_then() -> 
 
 def test_errors_are_a_function_of_seed_bus_and_attempt() -> None:
     def errors(seed: int, number: int) -> list[int]:
-        bus = BusTime(MEGA, seed, number, error_rate=0.2, note_errors=True)
+        bus = ArbitratedBus(MEGA, seed, number, error_rate=0.2, note_errors=True)
         for n in range(900):
             bus.send(n * 1_000_000, 1, Frame(n))
         bus.run(10**12)
@@ -410,7 +410,7 @@ def test_errors_are_a_function_of_seed_bus_and_attempt() -> None:
 
 @pytest.mark.parametrize(("errors", "after"), [(1, 0), (126, 125), (127, 126), (128, 119), (135, 119)])
 def test_a_receiver_counts_errors_of_others(errors: int, after: int) -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     for node in range(4):
         bus.send(0, node, Frame(node))
     bus.run(MEGA)
@@ -432,7 +432,7 @@ def test_a_receiver_counts_errors_of_others(errors: int, after: int) -> None:
 def test_an_error_costs_between_17_and_23_bits_besides_what_was_sent() -> None:
     costs = set()
     for seed in range(200):
-        bus = BusTime(MEGA, seed, error_rate=1.0, note_errors=True)
+        bus = ArbitratedBus(MEGA, seed, error_rate=1.0, note_errors=True)
         bus.send(0, 1, A)
         due_ns = bus.due_ns
         assert due_ns == 1
@@ -449,14 +449,14 @@ def test_an_error_costs_between_17_and_23_bits_besides_what_was_sent() -> None:
 
 @given(st.lists(frames(), min_size=1, max_size=30))
 def test_nothing_waits_longer_than_all_that_was_sent_takes(sent: list[tuple[int, Frame]]) -> None:
-    bus = BusTime(MEGA)
+    bus = ArbitratedBus(MEGA)
     for node, frame in sent:
         bus.send(0, node, frame)
     bound = sum(worst_case_bits(len(frame.data)) for _, frame in sent) - 3
     assert max(end_ns for _, end_ns, _, _ in bus.run(10**9)) <= bound * BIT
 
 
-@pytest.mark.parametrize("bus", [BusTime(MEGA), IdealBus()])
+@pytest.mark.parametrize("bus", [ArbitratedBus(MEGA), IdealBus()])
 def test_time_goes_on_and_frames_are_frames(bus: BusModel) -> None:
     bus.run(-10)
     with pytest.raises(ValueError, match="before -10 ns, not -11"):
@@ -474,14 +474,14 @@ def test_time_goes_on_and_frames_are_frames(bus: BusModel) -> None:
 
 def test_what_makes_no_bus() -> None:
     with pytest.raises(ValueError, match="bit rate must be at least 1, not 0"):
-        BusTime(0)
+        ArbitratedBus(0)
     with pytest.raises(ValueError, match="capacity must be at least 1, not 0"):
-        BusTime(MEGA, capacity=0)
+        ArbitratedBus(MEGA, capacity=0)
     with pytest.raises(ValueError, match="restart_ns must be at least 0, not -1"):
-        BusTime(MEGA, restart_ns=-1)
+        ArbitratedBus(MEGA, restart_ns=-1)
     for rate in (-0.1, 1.1, float("nan")):
         with pytest.raises(ValueError, match=r"error rate must be 0 \.\. 1"):
-            BusTime(MEGA, error_rate=rate)
+            ArbitratedBus(MEGA, error_rate=rate)
 
 
 def test_ideal_bus() -> None:

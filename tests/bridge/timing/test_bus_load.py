@@ -1,4 +1,4 @@
-"""Frame lengths and bus load, against a bit by bit construction and published numbers."""
+"""Frame lengths and bus load, compared with frames built bit by bit and with published numbers."""
 
 import pytest
 from hypothesis import given
@@ -8,7 +8,7 @@ from echelon.bridge.timing.bus_load import bus_load, frame_bits, many_frame_bits
 
 
 def by_hand(can_id: int, data: bytes, remote: bool = False) -> int:
-    """The same from a string of bits: CRC by long division, stuffing by replacing."""
+    """Returns `frame_bits` from a string of bits: CRC by long division, stuffing by replacement."""
     bits = f"0{can_id:011b}{remote:b}00{len(data):04b}" + "".join(f"{byte:08b}" for byte in data)
     remainder = int(bits, 2) << 15
     divisor = 0b1100010110011001  # the CRC-15 polynomial of CAN

@@ -1,4 +1,4 @@
-"""What `echelon validate` says of a bus is held against what a run then has on it."""
+"""The fit that `echelon validate` reports, compared with the frames of a run."""
 
 import pytest
 
@@ -29,7 +29,7 @@ def test_cyclic_identifiers_come_as_often_and_wait_no_longer_than_the_fit_says(
     traffic, fit = commander.buses[0].traffic, bus_fit(plan, 0)
     before: dict[int, int] = {}
     for time_ns in engine.instants():
-        if time_ns == 0:  # what brings drives up is not cyclic
+        if time_ns == 0:  # the frames of the bring-up are not cyclic
             before = {can_id: row.delivered for can_id, row in traffic.items()}
             for row in traffic.values():
                 row.latency_max_ns = 0

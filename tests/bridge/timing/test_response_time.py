@@ -1,4 +1,4 @@
-"""Worst-case response times: the paper's example, and against the bus in time, which must never be worse."""
+"""Worst-case response times: the example of the paper, and simulated buses, which must never be slower."""
 
 from collections import Counter
 from dataclasses import replace
@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.timing.arbitration import BusTime
+from echelon.bridge.timing.arbitration import ArbitratedBus
 from echelon.bridge.timing.bus_load import frame_bits, worst_case_bits
 from echelon.bridge.timing.response_time import BITRATES, Stream, advice, fits, load, remedies, response_times
 
@@ -71,8 +71,8 @@ def streams_of(case: Case) -> list[Stream]:
 
 
 def measured(releases: list[tuple[int, int, Frame]]) -> dict[int, int]:
-    """The longest response of each identifier for frames that should be queued and are queued at these bits."""
-    bus = BusTime(MEGA, capacity=10_000)
+    """Returns the longest response of each identifier, for releases (due, queued, frame) with times in bits."""
+    bus = ArbitratedBus(MEGA, capacity=10_000)
     due: dict[tuple[int, int], list[int]] = {}
     for wanted, queued, frame in sorted(releases, key=lambda release: release[1]):
         due.setdefault((frame.can_id, queued * BIT), []).append(wanted * BIT)
@@ -83,6 +83,7 @@ def measured(releases: list[tuple[int, int, Frame]]) -> dict[int, int]:
     return worst
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(cases(jitter=True), st.data())
 def test_nothing_measured_exceeds_the_bound(case: Case, data: st.DataObject) -> None:
@@ -98,13 +99,14 @@ def test_nothing_measured_exceeds_the_bound(case: Case, data: st.DataObject) -> 
         assert bound is None or worst[can_id] <= bound
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(cases(jitter=False), st.integers(0, 4))
 def test_the_bound_is_reached(case: Case, at: int) -> None:
-    """All that goes first falls together with the frame, just after the longest that goes last has started."""
+    """All frames of higher priority are queued with the frame, just after the longest of lower priority has started."""
     assume(at < len(case))
     own, lower = case[at][0].can_id, case[at + 1 :]
-    # what starts a bit earlier blocks for a bit less
+    # a frame that starts a bit earlier blocks for a bit less
     streams = [replace(stream, bits=stream.bits - (stream.can_id > own)) for stream in streams_of(case)]
     bound = response_times(streams, MEGA)[own]
     assume(bound is not None)
@@ -136,7 +138,7 @@ def test_no_offsets_of_three_streams_exceed_the_bound_and_some_reach_it() -> Non
 
 
 def robots_of(number: int, period_ns: int = MS, slow: bool = True) -> dict[str, list[Stream]]:
-    """Robots with a command, a feedback and a slow stream each."""
+    """Returns robots, each with a command, a feedback and a slow stream."""
     return {
         f"r{k}": [
             Stream(0x100 + k, period_ns),
@@ -166,7 +168,7 @@ def test_remedies_help_and_a_little_less_does_not(number: int, bitrate: int, sha
     else:
         assert [name for bus in ways.buses for name in bus] == list(robots)
         assert all(bus_fits(bus) for bus in ways.buses)
-        # robots are alike but for their identifiers: with a bus less, one bus has at least so many robots
+        # robots differ in their identifiers only: with one bus less, some bus has at least this many robots
         least = -(-number // (len(ways.buses) - 1))
         names = list(robots)
         assert not any(bus_fits(tuple(names[n : n + least])) for n in range(number - least + 1))

@@ -1,4 +1,4 @@
-"""What the doctor finds: the real things here, and files as other machines have them."""
+"""The doctor's checks: on this machine, and with files as they are on other machines."""
 
 import json
 import re
@@ -12,8 +12,8 @@ import pytest
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import resolve_url
 from echelon.sim.doctor import can_checks, doctor
+from echelon.sim.doctor.diagnosis import Diagnosis
 from echelon.sim.doctor.doctor import Measured
-from echelon.sim.doctor.finding import Finding
 from support.runs import echelon, plan_of
 
 
@@ -31,7 +31,7 @@ def test_this_machine_can_run_lab_and_says_so() -> None:
 def test_a_scenario_that_does_not_fit_is_exit_code_1_with_remedies() -> None:
     done = echelon("doctor", "paper", "--json")
     assert done.returncode == 1
-    found = {finding["what"]: finding for finding in json.loads(done.stdout)}
+    found = {result["what"]: result for result in json.loads(done.stdout)}
     assert found["bus can0"]["state"] == "problem"
     assert "does not fit" in found["bus can0"]["text"]
     assert any("2 buses" in advice for advice in found["bus can0"]["advice"])
@@ -50,7 +50,7 @@ def test_no_such_scenario() -> None:
 
 
 def test_zenoh_and_waking_are_measured() -> None:
-    found = {finding["what"]: finding for finding in json.loads(echelon("doctor", "--json").stdout)}
+    found = {result["what"]: result for result in json.loads(echelon("doctor", "--json").stdout)}
     assert found["Zenoh"]["state"] == "ok"
     assert re.fullmatch(r"sessions over tcp/127\.\S+:\d+, [1-9]\d* µs there and back", found["Zenoh"]["text"])
     measured = Measured()
@@ -70,33 +70,33 @@ def test_multicast_is_tried() -> None:
 def test_a_check_that_hangs_or_raises_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "LIMIT_S", 0.05)
     for_ever = threading.Event()
-    assert doctor._limited("x", lambda: Finding("x", str(for_ever.wait()), "")).text == "no answer within 0.05 s"
+    assert doctor._limited("x", lambda: Diagnosis("x", str(for_ever.wait()), "")).text == "no answer within 0.05 s"
     for_ever.set()
-    finding = doctor._limited("y", lambda: Finding("y", "ok", str(1 / int("0"))))
-    assert (finding.what, finding.state, finding.text) == ("y", "problem", "ZeroDivisionError: division by zero")
+    result = doctor._limited("y", lambda: Diagnosis("y", "ok", str(1 / int("0"))))
+    assert (result.what, result.state, result.text) == ("y", "problem", "ZeroDivisionError: division by zero")
 
 
 def test_neither_vcan_nor_multicast_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "check_vcan", lambda: Finding("vcan0", "note", "not there"))
-    monkeypatch.setattr(doctor, "check_multicast", lambda: Finding("multicast", "note", "not there"))
-    # a session in this process would be in the way of tests that fork
-    monkeypatch.setattr(doctor, "check_zenoh", lambda measured: Finding("Zenoh", "ok", "not tried"))
-    findings = doctor.examine()
-    assert [finding.what for finding in findings if finding.state == "problem"] == ["CAN bus"]
-    assert doctor.text(findings).endswith("NOT USABLE: CAN bus")
+    monkeypatch.setattr(doctor, "check_vcan", lambda: Diagnosis("vcan0", "note", "not there"))
+    monkeypatch.setattr(doctor, "check_multicast", lambda: Diagnosis("multicast", "note", "not there"))
+    # a session in this process would disturb other tests, which fork
+    monkeypatch.setattr(doctor, "check_zenoh", lambda measured: Diagnosis("Zenoh", "ok", "not tried"))
+    results = doctor.examine()
+    assert [result.what for result in results if result.state == "problem"] == ["CAN bus"]
+    assert doctor.text(results).endswith("NOT USABLE: CAN bus")
 
 
 def test_a_missing_package_is_a_problem() -> None:
-    finding = doctor.check_python(("numpy", "no-such-package"))
-    assert finding.state == "problem"
-    assert finding.text.endswith("not installed: no-such-package")
+    result = doctor.check_python(("numpy", "no-such-package"))
+    assert result.state == "problem"
+    assert result.text.endswith("not installed: no-such-package")
     assert doctor.check_python().state == "ok"
 
 
 def test_vcan_that_is_missing_or_not_up() -> None:
-    finding = can_checks.check_vcan("nosuch0")
-    assert (finding.what, finding.state) == ("nosuch0", "note")
-    assert "ip link add nosuch0 type vcan" in finding.advice[0] or "vcan.sh" in finding.advice[-1]
+    result = can_checks.check_vcan("nosuch0")
+    assert (result.what, result.state) == ("nosuch0", "note")
+    assert "ip link add nosuch0 type vcan" in result.advice[0] or "vcan.sh" in result.advice[-1]
     assert can_checks.check_vcan("lo").state == "ok"
 
 
@@ -104,9 +104,9 @@ def test_vcan_that_is_missing_or_not_up() -> None:
 def test_small_socket_buffers(most: int, state: str, tmp_path: Path) -> None:
     (tmp_path / "rmem_max").write_text(f"{most}\n")
     (tmp_path / "rmem_default").write_text("212992\n")
-    finding = doctor.check_buffers(tmp_path)
-    assert finding.state == state
-    assert f"{most // 1024} KiB, candump has 208 KiB" in finding.text
+    result = doctor.check_buffers(tmp_path)
+    assert result.state == state
+    assert f"{most // 1024} KiB, candump has 208 KiB" in result.text
     assert doctor.check_buffers(tmp_path / "nowhere").state == "note"
 
 
@@ -121,14 +121,14 @@ def test_which_interfaces_are_can(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
         (tmp_path / name / "tx_queue_len").write_text(f"{queue}\n")
-    findings = can_checks.check_interfaces(tmp_path)
-    assert [finding.what for finding in findings] == ["can7", "vcan7"]
-    assert "queue of 10 frames" in findings[0].text
-    assert findings[0].advice[-1].endswith("ip link set can7 txqueuelen 1000")
+    results = can_checks.check_interfaces(tmp_path)
+    assert [result.what for result in results] == ["can7", "vcan7"]
+    assert "queue of 10 frames" in results[0].text
+    assert results[0].advice[-1].endswith("ip link set can7 txqueuelen 1000")
 
 
 def can(state: str, up: bool = True, bitrate: int | None = 500_000) -> dict[str, Any]:
-    """As `ip -details -json link show` has it, in part."""
+    """Returns a part of the output of `ip -details -json link show`."""
     data: dict[str, Any] = {"state": state, "restart_ms": 0}
     if bitrate:
         data["bittiming"] = {"bitrate": bitrate, "sample_point": "0.875", "tq": 125}
@@ -152,10 +152,10 @@ def can(state: str, up: bool = True, bitrate: int | None = 500_000) -> dict[str,
     ],
 )
 def test_what_an_interface_needs(link: dict[str, Any], queue: int, text: str, advice: list[str]) -> None:
-    finding = can_checks._interface("can0", queue, link)
-    assert (finding.text, finding.state) == (text, "note" if advice else "ok")
-    assert len(finding.advice) == len(advice)
-    for one, wanted in zip(finding.advice, advice, strict=True):
+    result = can_checks._interface("can0", queue, link)
+    assert (result.text, result.state) == (text, "note" if advice else "ok")
+    assert len(result.advice) == len(advice)
+    for one, wanted in zip(result.advice, advice, strict=True):
         assert wanted in one
 
 

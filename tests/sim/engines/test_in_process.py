@@ -1,4 +1,4 @@
-"""Whole runs in one process: against continuous time, against what the paper claims, and against themselves."""
+"""Whole runs in one process, compared with continuous time, with the paper's claims, and with each other."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,20 +8,19 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from echelon.controller.laws.central import CentralLaw
-from echelon.controller.prediction.sampled import spectral_radius
 from echelon.messages import STATE_FIELDS
 from echelon.plan.plan import Array, Plan
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import load
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances
-from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace, TraceBuilder
-from support.synthetic import PAPER, run_facts
+from support.growth import radius_of
+from support.synthetic import PAPER, claims_of
 
 FIELD = {name: at for at, name in enumerate(STATE_FIELDS)}
 UNTIL = 2.0
-"""How long the paper's run is compared with continuous time [s]"""
+"""End of the comparison of the paper's run with continuous time [s]"""
 
 
 def run(overrides: Sequence[str] = (), path: Path = PAPER) -> Trace:
@@ -36,8 +35,10 @@ def late(delay: float) -> str:
 
 
 def continuous(plan: Plan, instants: Array) -> Array:
-    """Returns positions (T, N, 2) under the continuous law and ideal torque: p̈ = a means v̇ = e_v · a + d ω² and
-    ω̇ = (e_n · a - v ω)/d (docs/architecture.md, 2.1), state x, y, θ, v, ω per robot."""
+    """Returns positions (T, N, 2) under the continuous law with ideal torque.
+
+    The state of a robot is x, y, θ, v, ω.  p̈ = a means v̇ = e_v · a + d ω² and ω̇ = (e_n · a - v ω)/d
+    (docs/architecture.md, 2.1)."""
     central = CentralLaw(plan, lead=0.0)
     d = np.array([robot.offset for robot in plan.robots])
     count = len(plan.robots)
@@ -75,7 +76,7 @@ def reference() -> tuple[Array, Array]:
 
 
 def off(trace: Trace, reference: tuple[Array, Array], since: float) -> float:
-    """Returns how far any robot is from continuous time at any instant from `since` on [m]."""
+    """Returns the largest distance of a robot from its position in continuous time, from `since` [s] on [m]."""
     instants, positions = reference
     times_ns, states = trace.common()
     rows = [row for row, t in enumerate((times_ns * 1e-9).tolist()) if since - 1e-9 <= t <= UNTIL + 1e-9]
@@ -88,11 +89,11 @@ def off(trace: Trace, reference: tuple[Array, Array], since: float) -> float:
 def test_run_is_the_solution_in_continuous_time(paper, reference):
     assert off(paper, reference, 0.05) < 0.2
     assert off(paper, reference, 0.1) < 0.06
-    assert off(paper, reference, 0.05) < 0.04  # what the lead of the law leaves
+    assert off(paper, reference, 0.05) < 0.04  # the error that remains with `lead`
 
 
 def test_without_lead_the_hold_costs_what_its_period_is(reference):
-    """The hold alone: first order in the period; halving it halves the distance from continuous time."""
+    """The error of the hold is of first order: half the period gives half the distance from continuous time."""
     periods = ("periods={acceleration=0.001, torque=0.0001}", "periods={acceleration=0.0005, torque=0.00005}")
     coarse, fine = (run(["avoidance.enabled=false", "duration=0.2", "law.lead=0.0", period]) for period in periods)
     for since in (0.05, 0.1):
@@ -101,7 +102,7 @@ def test_without_lead_the_hold_costs_what_its_period_is(reference):
 
 
 def test_claims_of_the_paper_hold(paper):
-    rows = {row.block: row for row in summarise(paper, [], None, run_facts()).claims}
+    rows = {row.block: row for row in claims_of(paper)}
     assert [row.block for row in rows.values()] == ["intra", "inter", "centroid"]
     for row, about in zip(rows.values(), (0.1, 1.0, 10.0), strict=True):
         assert row.outcome == "passed"
@@ -129,7 +130,7 @@ def test_avoidance_keeps_robots_apart_where_they_would_meet(paper):
     assert kept.closest is not None
     assert kept.closest.distance > radius
     assert kept.violations == ()
-    for row in summarise(apart, [], None, run_facts()).claims:
+    for row in claims_of(apart):
         assert row.outcome == "passed"
 
 
@@ -150,13 +151,13 @@ def intra_peaks(trace: Trace) -> Array:
 
 
 def test_six_milliseconds_of_delay_settle_and_seven_do_not():
-    """As the spectral radii say: at 7 ticks the intra error grows at their pace, until the robots cannot follow."""
+    """This agrees with the spectral radius: at 7 ticks the intra error grows by it per tick, until robots cannot follow."""
     settled = intra_peaks(run(["duration=1.2", "avoidance.enabled=false", late(0.006)]))
     assert settled[-1] < 0.01
     unsettled = run(["duration=1.2", "avoidance.enabled=false", late(0.007)])
     peaks = intra_peaks(unsettled)
     assert not np.isfinite(peaks[-1])
-    pace = spectral_radius(unsettled.plan, 7) ** 50
+    pace = radius_of(unsettled.plan) ** 50
     assert pace > 1
     np.testing.assert_allclose(peaks[3:10] / peaks[2:9], pace, rtol=0.02)
 

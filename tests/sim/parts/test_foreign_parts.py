@@ -1,5 +1,5 @@
-"""Parts that others wrote and that fail: found before a run where that can be, and in a run named in one line, whichever way it
-runs, with all that was recorded kept and the wheels at zero."""
+"""Users' parts that fail.  They are found before a run if possible.  In a run of any kind the failure is one line, the
+recording is kept, and the wheels are at zero."""
 
 import json
 import re
@@ -57,7 +57,7 @@ USES = {
 }
 HANG = "while True: pass"
 LATER = {
-    # In the 31st period, which no trial before the run asks for; a trajectory's trial asks between the ticks.
+    # in the 31st period, which the trial before a run does not reach; the trial of a trajectory asks between ticks
     "law": 'if state[0] > 30 and block.name == "g2":',
     "path": "if 0.299 < t < 0.6 and abs(100 * t - round(100 * t)) < 1e-9:",
     "plant": "if 0.12 < state.v < 0.2:",
@@ -68,7 +68,7 @@ NAMED = {
     "plant": "mine.py:Mine of g2/r5: step ",
 }
 RUNS = {"law": "g2", "path": "coordinator", "plant": "g2/r5"}
-"""Who hangs"""
+"""The role that runs each part"""
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def run(folder: Path, use: str, *arguments: str, timeout: float = 120) -> Comple
 
 
 def one_line(err: str) -> str:
-    """Returns what was said on standard error, which must be one line and no traceback."""
+    """Returns the text of standard error, which must be one line without a traceback."""
     lines = err.strip().splitlines()
     assert len(lines) == 1, err
     return lines[0]
@@ -126,7 +126,7 @@ def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
     )
     assert (says if isinstance(says, str) else says[kind]) in text
     assert len(text.splitlines()) == 1
-    parse((folder / "mine.toml").read_text(), "mine.toml", [use], folder, trial=False)  # as what a run left is read
+    parse((folder / "mine.toml").read_text(), "mine.toml", [use], folder, trial=False)  # as the result of a run is read
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_file_that_never_ends_is_a_mistake_too(folder: Path, monkeypatch: pyte
 
 
 PACED = ("--clock", "wall", "--set", "duration=3.0", "--set", "periods={acceleration=0.05,torque=0.01}")
-"""At a pace that a busy machine keeps, too"""
+"""Arguments of a run on a wall clock that is slow enough for a busy machine"""
 WAYS = {
     "in process": ("--engine", "inprocess"),
     "in process, closed": ("--engine", "inprocess", "--set", "can.path=closed"),
@@ -175,7 +175,7 @@ WAYS = {
 
 
 def wheels_are_at_zero(folder: Path, dbc_name: str = "torque.dbc") -> None:
-    """The last torque frames of all robots in can.log want zero, drives disabled."""
+    """Checks that the last torque frames of all robots in can.log command zero torque and disable the drives."""
     import cantools
 
     database = cantools.database.load_file(folder / dbc_name)
@@ -204,7 +204,7 @@ def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way
     done = run(folder, use, *WAYS[way])
     assert done.returncode == 3, done.stderr
     said = one_line(done.stderr)
-    if "wall" in way:  # a node that hears a robot too late asks nobody in that period
+    if "wall" in way:  # a node that hears from a robot too late skips that period
         assert re.sub(r"\d\.\d+", "0.3", said) == f"echelon: {NAMED[kind]}raised KeyError: 'w'"
     else:
         assert said == f"echelon: {NAMED[kind]}raised KeyError: 'w'"
@@ -239,7 +239,7 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     use = write(folder, kind, f"{LATER[kind]}\n            {HANG}")
     done = run(folder, use, *WAYS[way], "--stall-timeout", "5")
     assert done.returncode == 3, done.stderr
-    said = done.stderr.strip().splitlines()[-1]  # before it, processes say whom they wait for
+    said = done.stderr.strip().splitlines()[-1]  # the lines before say which processes wait for which
     assert re.match(r"echelon: stalled for 5 s at t = [0-9.]+ s: everyone waits for ", said)
     assert f" {RUNS[kind]}" in said
     assert "which runs mine.py:Mine" in said
@@ -259,7 +259,7 @@ def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_is_named_a
 
 
 def test_a_part_that_cannot_be_made_ends_a_run_in_a_line(folder: Path) -> None:
-    """It can be made when it is tried, and not in the run."""
+    """The part can be made in the trial, but not in the run."""
     text = PLANT.replace("LINE", "pass") + (
         "\n    def step_of(self, robot):\n        made.append(1)\n"
         "        if len(made) > 1 or __import__('sys').argv[0] == '-c': 1 / 0\n        return super().step_of(robot)\n"
@@ -307,7 +307,7 @@ def _deaf() -> None:
     while True:
         try:
             _endless()
-        except BaseException:  # not even that keeps it
+        except BaseException:  # even this does not stop the limit
             raise
 
 
@@ -330,7 +330,7 @@ def test_limits_are_nested_and_the_outer_one_goes_on() -> None:
     with pytest.raises(TookTooLong, match=r"more than 0\.5 s"), time_limit(0.5):
         _within_an_endless_one()
     assert 0.4 < time.monotonic() - begun < 1
-    time.sleep(0.6)  # and nothing rings any more
+    time.sleep(0.6)  # no timer is left
 
 
 def test_a_limit_can_begin_anew() -> None:

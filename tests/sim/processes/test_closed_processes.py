@@ -1,4 +1,4 @@
-"""The closed torque path as processes, over Zenoh and a real bus: the same as in one process; and who stops whom."""
+"""The closed torque path as processes over Zenoh and a real bus: the same results as in one process, and stopping of wheels."""
 
 import os
 import signal
@@ -82,7 +82,7 @@ def DIGEST_OF_ONE_PROCESS() -> str:  # noqa: N802
 
 
 class Listener:
-    """Hears the native frames of a run on a bus: for each robot the last torques commanded and reported, with their times."""
+    """Listens to the native frames of a run on a bus; notes when each robot's drive reported, with and without torque."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -94,9 +94,9 @@ class Listener:
         self.moving = [0] * ROBOTS
         """How often a robot's drive reported torque"""
         self.still = [0] * ROBOTS
-        """How often in a row a robot's drive reported no torque"""
+        """How often in a row a robot's drive reported zero torque"""
         self.commands = 0
-        """Torque frames of the first robot"""
+        """Number of torque frames of the first robot"""
 
     def listen(self, until_ns: int) -> None:
         """Listens until an instant of the monotonic clock."""
@@ -104,7 +104,7 @@ class Listener:
             self._take(left_ns * 1e-9)
 
     def catch_up(self) -> None:
-        """Takes what has come and was not listened to yet."""
+        """Takes all frames that have come."""
         while self._take(0.0):
             pass
 
@@ -124,7 +124,7 @@ class Listener:
         return received is not None
 
     def await_still(self, robots: Iterable[int]) -> None:
-        """Listens until drives have reported no torque fifty times in a row."""
+        """Listens until the drives have reported zero torque `STILL` times in a row."""
         limit_s = time.monotonic() + 60
         while min(self.still[robot] for robot in robots) < STILL:
             assert time.monotonic() < limit_s, self.still
@@ -133,10 +133,10 @@ class Listener:
 
 @pytest.fixture
 def wall_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Listener, Path]]:
-    """A closed run in real time whose drives give torque; whatever is left of it is killed afterwards."""
+    """A closed run in real time whose drives give torque; remaining processes are killed afterwards."""
     url = resolve_url("auto")
     folder = tmp_path / "run"
-    # Drives that a busy machine starved come back.
+    # with recovery, drives go on after a busy machine has delayed their commands
     arguments = ["--clock", "wall", "--set", "can.path=closed", "--set", "robot.drive.recover_after=0.5"]
     arguments += ["--set", "claims=[]", "--can", url, "--quiet", "--no-report"]
     with open_bus(url) as bus:
@@ -154,12 +154,12 @@ def wall_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Listener, Path]]:
 
 
 HALF_A_SECOND = 500_000_000
-"""Five times the watchdog: what a busy machine may need on top of it"""
+"""Five times the watchdog: additional time that a busy machine may need"""
 
 
 @pytest.mark.parametrize("frozen", ["g1/r1", "g1", "coordinator", "bridge"])
 def test_who_is_frozen_lets_nobody_drive_on(wall_run: tuple[Popen[str], Listener, Path], frozen: str) -> None:
-    """Frozen and not killed: nobody sees it end, so watchdogs and ages of messages alone can tell."""
+    """A frozen process does not end, so only watchdogs and the ages of messages can notice it."""
     command, listener, _ = wall_run
     os.kill(pid_of(frozen, session_members(command.pid)), signal.SIGSTOP)
     listener.catch_up()
@@ -196,7 +196,7 @@ def test_who_is_killed_ends_the_run_without_torque(wall_run: tuple[Popen[str], L
     assert command.wait(30) == 3
     assert any(killed in reason for reason in reasons(summary_of(folder)))
     frames = [logged.frame for logged in read_log(folder / "can.log")]
-    if killed != "bridge":  # whose last word is to disable all drives
+    if killed != "bridge":  # otherwise the bridge disables all drives at the end
         codec = NativeCodec(SCALE)
         for robot in range(ROBOTS):
             last = [frame for frame in frames if frame.can_id == BASE_ID + robot][-1]
@@ -206,7 +206,7 @@ def test_who_is_killed_ends_the_run_without_torque(wall_run: tuple[Popen[str], L
 
 
 def paced_run(folder: Path, *more: str) -> dict[str, Any]:
-    """Runs the lab on a wall clock on a bus that is as slow as a real one; returns what the summary says of the bus."""
+    """Runs the lab on a wall clock on a paced bus; returns the part `can` of the summary."""
     sets = ["can.path=closed", "can.timing=bits", "duration=2.5", "claims=[]", *more]
     arguments = [word for value in sets for word in ("--set", value)]
     echelon("run", "lab", "--clock", "wall", "--quiet", "--no-report", "--out", folder, *arguments)
@@ -222,8 +222,8 @@ def test_on_a_wall_clock_an_overloaded_bus_is_late_and_loses(tmp_path: Path) -> 
     assert 0.7 < bus["load"] < 1.01
     frames = [(frame.time_ns, frame_bits(*frame.frame)) for frame in read_log(tmp_path / "run" / "can.log")]
     taken_ns = sum(bits for _, bits in frames[1:]) * 1_000_000_000 // bitrate
-    assert 0.7 < taken_ns / (frames[-1][0] - frames[0][0]) < 1.1  # what a process held up goes out a bit denser
-    # Commands have lower identifiers than what drives say: they are held up by themselves alone, those by all of them.
+    assert 0.7 < taken_ns / (frames[-1][0] - frames[0][0]) < 1.1  # frames that a process delayed go out slightly denser
+    # commands have lower identifiers than feedback: commands wait for each other only, feedback waits for all of them
     commands, feedback = (
         [bus["identifiers"][f"{first + robot:03X}"] for robot in range(ROBOTS)] for first in (BASE_ID, FEEDBACK_ID)
     )
@@ -250,7 +250,7 @@ def test_on_a_wall_clock_errors_come_on_schedule_and_a_controller_that_is_off_co
     ]
     assert not [at for at in times_s if off_s + 0.25 < at < back_s - 0.01]
     assert [at for at in times_s if at > back_s]
-    assert can["referee"]["kinds"]  # it saw that something was missing
+    assert can["referee"]["kinds"]  # the referee found missing frames
 
 
 @pytest.mark.parametrize("protocol", ["native", "odrive", "cia402"])

@@ -1,4 +1,4 @@
-"""A run's processes come up together, give what one process gives, and go down together, however they end."""
+"""The processes of a run start together, give the results of one process, and end together, for whatever reason."""
 
 import os
 import re
@@ -51,7 +51,7 @@ def supervised(plan: Plan, folder: Path, **options: object) -> Outcome:
 
 @pytest.fixture
 def long_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Path]]:
-    """A run that would take minutes, once it is recording; whatever is left of it is killed afterwards."""
+    """A run that would take minutes and is recording already; remaining processes are killed afterwards."""
     folder = tmp_path / "run"
     command = start_echelon("run", "paper", "--set", "duration=1000", "--can", "virtual", "--quiet", "--out", folder)
     try:
@@ -64,7 +64,7 @@ def long_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Path]]:
 
 
 def finished(command: Popen[str]) -> tuple[int, str, str]:
-    """Waits for the end of a run; all its processes must be gone by then, or in the moment after."""
+    """Waits for the end of a run, and checks that all its processes are gone then or shortly after."""
     out, err = command.communicate(timeout=30)
     assert until(lambda: not session_members(command.pid), 5), session_members(command.pid)
     return command.returncode, out, err

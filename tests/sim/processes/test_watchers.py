@@ -1,4 +1,4 @@
-"""Those who watch a run get its messages in order, count what is none, and end with all that was sent."""
+"""Watchers get the messages of a run in order, count invalid ones, and end with all that was sent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TICKS = 6
 
 
 class Inbox:
-    """Gives out what it was given, one portion at a time; nothing when that is all."""
+    """Stands for the session: returns the given portions of batches one by one, then nothing."""
 
     def __init__(self, *portions: list[bytes]) -> None:
         self.portions = list(portions)
@@ -43,12 +43,12 @@ def batches_by_source(messages: list[Message]) -> list[bytes]:
 
 
 def reception(inbox: Any) -> Reception:
-    """Returns the reception of the paper's members."""
+    """Returns a reception for the members of the paper's scenario."""
     return Reception(inbox, range(len(paper().formation)), paper())
 
 
 def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
-    """Returns what messages are ordered by."""
+    """Returns the keys of the order of messages."""
     return [(each.time_ns, each.source, each.channel) for each in messages]
 
 
@@ -66,7 +66,7 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
     good = batches_by_source(messages)
     size = messages[0].values.size
     strangers = [Message(Channel.STATE, 99, 0, 0, np.zeros(size)), Message(Channel.COMMAND, 1, 0, 0, np.zeros(2))]
-    leader, root = paper().nodes[0], paper().root  # one has no nodes below it, the other no parent and no robots
+    leader, root = paper().nodes[0], paper().root  # the leader has no child nodes; the root has no parent and no robots
     for node, channel in ((leader, Channel.REFERENCE), (root, Channel.GROUP_STATE), (root, Channel.COMMAND)):
         strangers.append(Message(channel, node.index, 0, 0, np.zeros(6)))
     stranger = batch(strangers)
@@ -95,7 +95,7 @@ def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.Monk
     silent = Inbox(*parts[:3], [], *parts[3:])  # a broken run: after silence nothing is waited for
     out = [m for portion in reception(silent).drain(None) for m in portion]
     assert {m.source for m in out} == {0, 1, 2}
-    monkeypatch.setattr(watchers, "DRAIN_S", 0.05)  # what never comes is not waited for for ever
+    monkeypatch.setattr(watchers, "DRAIN_S", 0.05)  # the wait for missing messages ends
     assert keys([m for portion in reception(Inbox(*parts[:3])).drain(999) for m in portion]) == sorted(keys(out))
 
 

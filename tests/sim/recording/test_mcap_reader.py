@@ -1,4 +1,4 @@
-"""sim.recording.mcap_reader: states come back bit for bit, cut files are mended, garbage is a ValueError."""
+"""sim.recording.mcap_reader: states are read bit for bit, cut-off files are recovered, garbage raises ValueError."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -148,7 +148,7 @@ def test_a_recording_of_another_plan_is_refused(whole: Path) -> None:
 
 
 def test_a_foreign_recording_is_refused_but_mended(tmp_path: Path) -> None:
-    """Of other schemas, uncompressed, without chunks."""
+    """The recording has other schemas, no compression and no chunks."""
     path = tmp_path / "foreign.mcap"
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE, use_chunking=False)
@@ -167,7 +167,7 @@ def test_a_foreign_recording_is_refused_but_mended(tmp_path: Path) -> None:
 
 
 def survives(path: Path) -> None:
-    """Reads a file in every way; only ValueError with one line that names the file may come of it."""
+    """Reads a file with every function; each may only raise ValueError with one line that names the file."""
     readers = (lambda: read_trace(path, paper()), lambda: read_scenario(path), lambda: read_metadata(path))
     for read in (*readers, lambda: read_links(path), lambda: recover(path, path.with_name("mended"))):
         try:
@@ -192,7 +192,7 @@ def test_garbage(tmp_path: Path, garbage: bytes) -> None:
 @fuzz
 @given(st.lists(st.tuples(st.integers(1, 12), st.binary(max_size=60)), max_size=6))
 def test_records_of_garbage(tmp_path: Path, records: list[tuple[int, bytes]]) -> None:
-    """Well-framed records, so that their insides are looked at."""
+    """The records have correct lengths, so that their content is parsed."""
     path = tmp_path / "garbage"
     framed = [bytes([opcode]) + len(body).to_bytes(8, "little") + body for opcode, body in records]
     path.write_bytes(b"\x89MCAP0\r\n" + b"".join(framed))

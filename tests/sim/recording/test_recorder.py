@@ -1,4 +1,4 @@
-"""What is in a recording, that it is always the same, and what survives when something fails."""
+"""The content of a recording, its repeatability, and what survives a kill or a full disk."""
 
 import json
 import math
@@ -80,7 +80,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Messa
 
 @contextmanager
 def decoded(path: Path) -> Iterator[Iterator[tuple[str, int, Any]]]:
-    """Gives topic, time and message of everything in a file, as rosbags reads it by the schemas in the file."""
+    """A context that yields topic, time and message of each record of a file, as rosbags reads it by the file's schemas."""
     with AnyReader([path]) as reader:
         yield ((c.topic, time_ns, reader.deserialize(raw, c.msgtype)) for c, time_ns, raw in reader.messages())
 
@@ -205,7 +205,7 @@ def test_before_a_robot_speaks_it_stands_at_its_start(tmp_path: Path) -> None:
 
 
 def test_the_same_run_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whenever the wall clock made it write in between."""
+    """The bytes do not depend on the times of provisional writes."""
     monkeypatch.setattr(chunked, "CHUNK_SIZE", 20_000)
     contents = set()
     for flush_every in (0, 1, 7, 100):
@@ -239,7 +239,7 @@ def test_a_place_that_does_not_exist_is_an_error_at_once(tmp_path: Path) -> None
 
 
 def test_at_no_instant_more_than_a_fifth_of_a_second_is_missing_on_disk(tmp_path: Path) -> None:
-    """A clock of its own, and a chunk that is never filled: only what was written provisionally counts."""
+    """With a simulated clock and a chunk that is never full, only provisional writes bring messages to the disk."""
     path, tick_ns = tmp_path / "run.mcap", 9_000_000
     with closing(Recorder(path, paper(), SCENARIO, METADATA)) as recorder:
         for tick in range(100):
@@ -251,7 +251,7 @@ def test_at_no_instant_more_than_a_fifth_of_a_second_is_missing_on_disk(tmp_path
 
 
 def test_a_chunk_shorter_than_what_stood_there_provisionally(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing of the longer one remains."""
+    """No bytes of the longer provisional chunk remain."""
     path, poor = tmp_path / "run.mcap", iter([True])
     good = zstandard.ZstdCompressor(level=chunked.LEVEL)
 

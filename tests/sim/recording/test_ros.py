@@ -1,4 +1,4 @@
-"""sim.recording.ros: every encoder against hand-laid bytes and against the serializer of rosbags, for random values."""
+"""sim.recording.ros: every encoder, compared with bytes written by hand and with rosbags for random values."""
 
 import struct
 from typing import Any
@@ -37,7 +37,7 @@ def header(time_ns: int, frame_id: str) -> Any:
 
 
 def serialized(name: str, message: Any) -> bytes:
-    """Returns what rosbags makes of a message."""
+    """Returns a message as bytes, as rosbags serializes it."""
     return bytes(STORE.serialize_cdr(message, ros.schema_name(name)))
 
 
@@ -113,7 +113,7 @@ def test_frame_of_more_than_eight_bytes_is_refused() -> None:
 
 @pytest.mark.parametrize("name", FULL_NAMES)
 def test_standard_types_are_the_standard(name: str) -> None:
-    """Same type hash as in the distribution, so any ROS program takes them for its own."""
+    """The type hashes are those of the ROS distribution, so ROS programs accept the messages."""
     standard = get_typestore(Stores.ROS2_HUMBLE)
     if name in standard.fielddefs:
         assert STORE.hash_rihs01(name) == standard.hash_rihs01(name)

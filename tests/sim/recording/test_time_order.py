@@ -1,4 +1,4 @@
-"""Messages of many sources come out in one order of time, whatever the order in which their batches came."""
+"""Messages of many sources are released in one order of time, whatever the order of arrival of their batches."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from echelon.sim.recording.time_order import TimeOrder
 
 
 def message(source: int, time_ns: int, channel: Channel = Channel.STATE) -> Message:
-    """Returns a message that says nothing but where it belongs."""
+    """Returns a message with source, time and channel only."""
     return Message(channel, source, time_ns, time_ns, np.empty(0))
 
 
 def keys(messages: list[Message]) -> list[tuple[int, int, int]]:
-    """Returns what messages are ordered by."""
+    """Returns the keys of the order of messages."""
     return [(each.time_ns, each.source, each.channel) for each in messages]
 
 
@@ -27,7 +27,7 @@ sources = st.lists(
     min_size=1,
     max_size=4,
 )
-"""Of each source its period and its channels"""
+"""Period and channels of each source"""
 
 
 @given(sources, st.integers(0, 12), st.randoms(use_true_random=False), st.integers(1, 7))
@@ -48,7 +48,7 @@ def test_order_does_not_depend_on_batches(
             if any(left):
                 batch.append(choose.choice([stream for stream in left if stream]).pop(0))
         released += order.push(batch)
-        # All that is out is a beginning of the whole, and no source can still say anything within it.
+        # the released messages are the beginning of the whole order, and no source can send a message within it any more
         assert keys(released) == keys(everything[: len(released)])
         if released:
             assert all(stream[0].time_ns > released[-1].time_ns for stream in left if stream)

@@ -5,8 +5,9 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from echelon.controller.prediction.sampled import largest_stable_delay
+from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.transformation import Transformation
+from echelon.messages import Channel
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import parse
 from echelon.sim.results.block_series import block_series
@@ -84,7 +85,7 @@ def test_a_lag_is_no_growth_and_nothing_fails():
 @pytest.mark.parametrize("beyond", [0, 4])
 def test_runs_grow_where_the_analysis_of_the_sampled_loop_says_so_and_only_there(beyond):
     plan = plan_of("lab", "claims=[]")
-    ticks = largest_stable_delay(plan, 500) + beyond
+    ticks = largest_extra_delay(plan, Channel.STATE).ticks + beyond
     delayed = plan_of("lab", "claims=[]", f"links=[{{channel='state', delay={ticks * plan.root.period_ns / 1e9}}}]")
     trace, links = run_of(delayed)
     summary = summarise(trace, links, None, run_facts())

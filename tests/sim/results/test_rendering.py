@@ -24,6 +24,7 @@ def test_every_record_is_described() -> None:
         assert table["properties"], name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -1,4 +1,4 @@
-"""What a person sees of a run: lines where there is no terminal, a table where there is one."""
+"""The display of a run: lines without a terminal, a table in a terminal."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ PLAN = plan_of("paper")
 
 
 class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self) -> bool:
-        """It is."""
+        """Returns True."""
         return True
 
 

@@ -1,4 +1,4 @@
-"""What `echelon can` and `echelon referee` show, of runs that have been and of buses that are alive."""
+"""The output of `echelon can` and `echelon referee` for finished runs and for live buses."""
 
 import io
 import json
@@ -34,7 +34,7 @@ def free_url() -> str:
 
 @pytest.fixture
 def table() -> CanTable:
-    """Two robots of the lab: one drives, one is in fault; nothing came from the others."""
+    """A table of the lab: one robot drives, one is in a fault, and no frames came from the others."""
     plan = plan_of("lab", "can.path=closed", "claims=[]")
     codec = NativeCodec(plan.can.torque_scale)
     made = CanTable(plan, Referee(plan), ("socketcan:vcan0",))

@@ -1,0 +1,119 @@
+"""All that `echelon analyse` says of a plan (docs/architecture.md, 2.7): as it is, and how much later messages may be."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import inf, log
+
+from echelon.controller.prediction.block_margin import delay_margin
+from echelon.controller.prediction.gains import PredictionError, linear_gains
+from echelon.controller.prediction.largest_delay import LargestDelay, largest_extra_delay
+from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_links, untreated
+from echelon.controller.prediction.spectrum import spectral_radius
+from echelon.messages import Channel
+from echelon.plan.plan import LinkPlan, Plan
+
+
+@dataclass(frozen=True, slots=True)
+class BlockMargin:
+    """A block alone, in continuous time, with its law as it stands (without `lead`)."""
+
+    name: str
+    sigma: float
+    """[s]"""
+    margin: float | None
+    """The largest delay that it bears [s]; None if it is unstable without any"""
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What is predicted of the linear run of a plan."""
+
+    delays: dict[Channel, tuple[float, ...]]
+    """The delays [s] that the links of each channel have in the scenario, each once, in ascending order"""
+    acceleration_periods: tuple[float, ...]
+    """Of the nodes [s], each once"""
+    torque_periods: tuple[float, ...]
+    """Of the robots [s], each once"""
+    blocks: tuple[BlockMargin, ...]
+    hyperperiod: float
+    """[s]"""
+    radius: float
+    """Spectral radius of the run's map over one hyperperiod: errors are multiplied by it in the long run"""
+    later: dict[Channel, LargestDelay]
+    """By channel how much later all its messages may be, beyond the delays that they have; empty if that is unstable already"""
+    centroid_age: float
+    """How old, on average over the robots, positions are when the coordinator uses them [s]: a formation that moves with a
+    constant velocity is off by that much of its way, which is no instability"""
+
+    @property
+    def settles(self) -> bool:
+        """True if errors vanish in the long run."""
+        return self.radius < 1
+
+    @property
+    def time_constant(self) -> float:
+        """The time [s] in which errors shrink, or grow, by the factor e in the long run."""
+        return inf if self.radius == 1 else self.hyperperiod / abs(log(self.radius)) if self.radius > 0 else 0.0
+
+
+def analyse(plan: Plan) -> Analysis:
+    """Returns what is predicted of a plan.
+
+    Raises PredictionError if nothing exact can be said: the law is not linear, links lose messages or have delays that vary,
+    messages are older than their timeout when they would be used, or too many messages are on their way."""
+    blocks = tuple(
+        BlockMargin(block.name, block.sigma, delay_margin(linear_gains(plan, block, 0.0)))
+        for block in plan.blocks
+        if block.size
+    )
+    if found := untreated(plan):
+        raise PredictionError(f"{describe_untreated(found)}: only constant delays without loss are treated")
+    run = LinearRun(plan)
+    radius = spectral_radius(run.map())
+    links = {channel: ruled_links(plan, channel) for channel in CHANNELS}
+    there = [channel for channel in CHANNELS if links[channel]]
+    return Analysis(
+        {channel: _each_once(link.delay_min_ns for link in links[channel]) for channel in there},
+        _each_once(node.period_ns for node in plan.nodes),
+        _each_once(robot.torque_period_ns for robot in plan.robots),
+        blocks,
+        run.hyperperiod_ns * 1e-9,
+        radius,
+        {channel: largest_extra_delay(plan, channel) for channel in there} if radius < 1 else {},
+        _centroid_age(plan),
+    )
+
+
+def describe_untreated(links: Sequence[LinkPlan]) -> str:
+    """Returns which links lose messages or have delays that vary: channels, how many links, and what they are like."""
+
+    def like(link: LinkPlan) -> str:
+        low, high = link.delay_min_ns / 1e9, link.delay_max_ns / 1e9
+        loss = [f"lose {100 * link.loss:g} % of their messages"] if link.loss else []
+        return " and ".join([*loss, *([f"have delays from {low:g} to {high:g} s"] if high > low else [])])
+
+    found = Counter((link.channel.name.lower(), like(link)) for link in links)
+    return ", ".join(f"{count} {channel} links {what}" for (channel, what), count in found.items())
+
+
+def _centroid_age(plan: Plan) -> float:
+    """Returns how old robots' positions are when the coordinator uses them [s], on average."""
+    links = {(link.source, link.receiver): link for link in plan.links if link.channel in _UP}
+    ages = []
+    for robot in plan.robots:
+        member, age_ns, now_ns = robot.index, 0, 0
+        while (parent := plan.formation[member].parent) is not None:
+            link = links[member, parent]
+            used_ns = -(-(now_ns + link.delay_min_ns) // link.period_ns) * link.period_ns
+            age_ns, now_ns, member = used_ns, used_ns, parent
+        ages.append(age_ns)
+    return sum(ages) / len(ages) * 1e-9
+
+
+_UP = (Channel.STATE, Channel.GROUP_STATE)
+
+
+def _each_once(instants_ns: Iterable[int]) -> tuple[float, ...]:
+    """Returns numbers in seconds, each once, in ascending order."""
+    return tuple(each / 1e9 for each in sorted(set(instants_ns)))

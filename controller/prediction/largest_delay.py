@@ -1,0 +1,159 @@
+"""How much later all messages of a channel may be before the run near its formation is unstable (docs/architecture.md, 2.7).
+
+All links of the channel get the same delay more, beyond what they have.  It acts in ticks: a message is used at instants of its
+receiver, and said at instants of its source.
+
+*One period for all.*  The linear run is cut open where the channel is said (`LinearRun.loop`).  From what is handed over to
+what is said it is
+
+    R(z) = C (z - A)⁻¹ B + D
+
+so with k ticks more it has the roots of det(I - z^{-k} R(z)) = 0.  `controller.prediction.crossings` says for which k the first
+of them reaches the unit circle: no delay is tried out, and none is left out, however large it is.  This takes k as continuous,
+which is sound where the eigenvalues of R(-1) are smaller than 1.  What it finds is confirmed by the map with one tick less and
+with just as many, unless that is larger than `CONFIRMED`.
+
+*Otherwise* one delay after the other is tried out, up to `TRIED` ticks.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from math import ceil, gcd, inf, pi
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import block_array, csc_array, csr_array, eye_array
+from scipy.sparse.linalg import splu
+
+from echelon.controller.prediction.crossings import Eigenvalues, crossings, smallest_delay, unstable_roots
+from echelon.controller.prediction.gains import PredictionError, linear_gains
+from echelon.controller.prediction.linear_run import LinearRun, Loop, later, ruled_links
+from echelon.controller.prediction.spectrum import spectral_radius, strong_parts
+from echelon.messages import Channel
+from echelon.plan.can_plan import NEVER_NS
+from echelon.plan.plan import Array, Plan
+
+TRIED: Final = 50
+"""Ticks up to which delays are tried out"""
+CONFIRMED: Final = 800
+"""Largest map that confirms what was found in another way"""
+SLOW: Final = 1e-3
+"""Crossings are looked for from this share of the slowest block's natural frequency on"""
+SMALL: Final = 150
+"""Up to this size equations are solved as dense ones"""
+RANK: Final = 1e-12
+"""Singular values below this share of the largest are zero"""
+_TOGETHER: Final = 32
+"""Frequencies that are computed at once"""
+
+
+@dataclass(frozen=True, slots=True)
+class LargestDelay:
+    """How much later the messages of a channel may be."""
+
+    tick_s: float
+    ticks: int | None
+    """Every additional delay of 0 to `ticks` ticks is stable; None: not even 0 is"""
+    ends: Literal["unstable", "timeout", "limit"]
+    """Why it is not more: one tick more is unstable, or older than a link's timeout allows, or has not been tried out"""
+
+    @property
+    def seconds(self) -> float | None:
+        """The same in seconds."""
+        return None if self.ticks is None else self.ticks * self.tick_s
+
+
+def largest_extra_delay(plan: Plan, channel: Channel) -> LargestDelay:
+    """Returns how much later all messages of a channel may be, in a plan whose links have constant delays and lose nothing.
+
+    Raises PredictionError if nothing exact can be said of the plan as it is, ValueError if it has no such link."""
+    links = ruled_links(plan, channel)
+    if not links:
+        raise ValueError(f"channel {channel.name.lower()}: there is no link of it")
+    run = LinearRun(plan)
+    tick_ns = gcd(*(link.period_ns for link in links), *run.periods(channel))
+    if spectral_radius(run.map()) >= 1:
+        return LargestDelay(tick_ns * 1e-9, None, "unstable")
+    is_single_rate = run.periods() == {tick_ns}
+    if is_single_rate and (unstable := _first_unstable(run, channel)) is not None:
+        too_old = min(link.timeout_ns // tick_ns - -(-link.delay_min_ns // tick_ns) for link in links) + 1
+        ends: Literal["unstable", "timeout"] = "unstable" if unstable < too_old else "timeout"
+        return LargestDelay(tick_ns * 1e-9, min(unstable, too_old) - 1, ends)
+    for ticks in range(1, TRIED + 1):
+        try:
+            late = LinearRun(later(plan, channel, ticks * tick_ns))
+        except PredictionError:
+            return LargestDelay(tick_ns * 1e-9, ticks - 1, "timeout")
+        if spectral_radius(late.map()) >= 1:
+            return LargestDelay(tick_ns * 1e-9, ticks - 1, "unstable")
+    return LargestDelay(tick_ns * 1e-9, TRIED, "limit")
+
+
+def _first_unstable(run: LinearRun, channel: Channel) -> int | None:
+    """Returns the smallest unstable k of a run that is stable for k = 0; None if the criterion does not hold, or if the map
+    says otherwise."""
+    plan = run.plan
+    stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
+    slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
+    low = SLOW * slowest * run.hyperperiod_ns * 1e-9
+    found = []
+    for eigenvalues in _parts(run.loop(channel)):
+        if np.abs(eigenvalues(np.array([pi]))).max() >= 1:
+            return None
+        found += crossings(eigenvalues, low, pi)
+    edge = smallest_delay(found)
+    if edge == inf:
+        return None
+    k = max(1, ceil(edge))
+    while unstable_roots(found, k) <= 0:
+        k += 1
+    for ticks, is_stable in ((k - 1, True), (k, False)):
+        late = LinearRun(later(_patient(plan), channel, ticks * run.hyperperiod_ns))
+        if late.size <= CONFIRMED and (spectral_radius(late.map()) < 1) != is_stable:
+            return None
+    return k
+
+
+def _patient(plan: Plan) -> Plan:
+    """Returns a plan whose links have no timeout."""
+    return replace(plan, links=tuple(replace(link, timeout_ns=NEVER_NS) for link in plan.links))
+
+
+def _parts(loop: Loop) -> Iterator[Eigenvalues]:
+    """Yields the eigenvalues of R(e^{jω}) for parts of the run that act on each other, each different part once."""
+    size = loop.A.shape[0]
+    seen = set()
+    for rows in strong_parts(csr_array(block_array([[loop.A, loop.B], [loop.C, loop.D]]))):
+        x, u = rows[rows < size], rows[rows >= size] - size
+        part = Loop(loop.A[x][:, x], loop.B[x][:, u], loop.C[u][:, x], loop.D[u][:, u])
+        known = tuple(matrix.toarray().tobytes() for matrix in (part.A, part.B, part.C, part.D))
+        if part.B.nnz + part.D.nnz and known not in seen:
+            seen.add(known)
+            yield _eigenvalues(part)
+
+
+def _eigenvalues(part: Loop) -> Eigenvalues:
+    """Returns the eigenvalues of R(e^{jω}) as a function of ω.
+
+    What is handed over acts through few combinations, (B; D) = F V: V R' with R' = (C (z - A)⁻¹, 1) F has the same eigenvalues,
+    most zeros left out."""
+    size = part.A.shape[0]
+    left, strengths, V = np.linalg.svd(np.vstack([part.B.toarray(), part.D.toarray()]), full_matrices=False)
+    rank = int((strengths > RANK * strengths.max()).sum())
+    F, V = left[:, :rank] * strengths[:rank], V[:rank]
+    VC, VD = V @ part.C, V @ F[size:]
+    into_x = F[:size].astype(complex)
+    dense, sparse, unit = part.A.toarray() if size <= SMALL else None, csc_array(part.A), eye_array(size, format="csc")
+
+    def states(z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Returns (z - A)⁻¹ F for several z."""
+        if dense is not None:
+            return np.linalg.solve(z[:, None, None] * np.eye(size) - dense, into_x[None])
+        return np.array([splu(csc_array(each * unit - sparse)).solve(into_x) for each in z])
+
+    def eigenvalues(omega: Array) -> NDArray[np.complex128]:
+        some = np.array_split(omega, max(1, len(omega) // _TOGETHER))
+        return np.concatenate([np.linalg.eigvals(VC @ states(np.exp(1j * each)) + VD) for each in some])
+
+    return eigenvalues

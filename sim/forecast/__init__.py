@@ -1,0 +1,1 @@
+"""What a valid scenario will not do well, said before it is run."""

@@ -1,0 +1,134 @@
+"""Warnings about what the start asks of robots: torque, wheel speed, and a torque loop that is fast enough.
+
+What is asked is that of points which do exactly what the law wants, over ideal links, for the first `STEPS` periods.
+
+*Torque* at the start: the inverse of docs/architecture.md, 2.1, for a robot at rest with its own heading.  *Wheel speed*: a
+robot that moves straight ahead at |v| turns its wheels at |v|/r; turning asks for more.
+
+*Torque loop.*  A robot that moves at v turns into its direction of travel: with no acceleration wanted, ω̇ = -(v/d) ω.  The
+torque loop computes that for the middle of its period h and holds it, so with q = h v/d
+
+    ω⁺ = (1 - q + q²/2) ω
+
+which dies away if and only if q < 2.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from echelon.agents.plant import state_at
+from echelon.agents.torque import make_inverse
+from echelon.controller.laws.central import CentralLaw
+from echelon.controller.trajectory import make_trajectory, sample
+from echelon.errors import PartRunError
+from echelon.plan.plan import Array, Plan, RobotPlan
+
+STEPS: Final = 1000
+"""Periods for which points are followed"""
+INSTANTS: Final = 200
+"""At which the trajectory's speed is looked at, over the whole run"""
+EDGE: Final = 2.0
+"""q from which on the torque loop diverges"""
+NEAR: Final = 1.0
+"""q from which on it is near that"""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What the start asks of robots, in their order."""
+
+    accelerations: Array
+    """At the start, (N, 2) [m/s²]"""
+    speeds: Array
+    """The largest, (N,) [m/s]"""
+
+
+def asked_of(plan: Plan) -> Asked:
+    """Returns what is asked of the robots of a plan.  Raises PartRunError if a part that others wrote fails."""
+    T = min(node.period_ns for node in plan.nodes) * 1e-9
+    law = CentralLaw(plan)
+    positions, velocities = np.array([robot.start for robot in plan.robots]), np.zeros((len(plan.robots), 2))
+    times = np.linspace(0.0, plan.duration_ns * 1e-9, INSTANTS)
+    travel = np.linalg.norm(sample(make_trajectory(plan.trajectory), times)[:, 1], axis=1).max()
+    speeds = np.full(len(plan.robots), travel)
+    first = None
+    with np.errstate(all="ignore"):
+        for step in range(min(STEPS, plan.duration_ns // round(T * 1e9))):
+            a = law(step * T, positions, velocities)
+            first = a if first is None else first
+            positions, velocities = positions + T * velocities + T**2 / 2 * a, velocities + T * a
+            speed = np.linalg.norm(velocities, axis=1)
+            if not np.isfinite(speed).all():
+                break
+            speeds = np.maximum(speeds, speed)
+    return Asked(velocities if first is None else first, speeds)
+
+
+def motion_warnings(plan: Plan) -> list[str]:
+    """Returns a line for each limit that the start asks more than, and one for a torque loop that is too slow."""
+    try:
+        asked = asked_of(plan)
+    except PartRunError as error:
+        return [str(error)]
+    found = []
+    torques = [_start_torque(robot, *a) for robot, a in zip(plan.robots, asked.accelerations.tolist(), strict=True)]
+    beyond = [at for at, robot in enumerate(plan.robots) if not torques[at] <= robot.torque_limit]
+    if beyond:
+        worst = max(beyond, key=lambda at: torques[at] / plan.robots[at].torque_limit)
+        found.append(
+            f"torque_limit = {plan.robots[worst].torque_limit:g}: the start asks {torques[worst]:.3g} N m of a wheel of "
+            f"{_named(plan, worst, len(beyond))}"
+        )
+    rates = [speed / robot.wheel_radius for speed, robot in zip(asked.speeds.tolist(), plan.robots, strict=True)]
+    beyond = [at for at, robot in enumerate(plan.robots) if rates[at] > robot.wheel_speed_limit]
+    if beyond:
+        worst = max(beyond, key=lambda at: rates[at] / plan.robots[at].wheel_speed_limit)
+        found.append(
+            f"wheel_speed_limit = {plan.robots[worst].wheel_speed_limit:g}: start and trajectory ask {rates[worst]:.3g} rad/s "
+            f"({asked.speeds[worst]:.3g} m/s) of {_named(plan, worst, len(beyond))}"
+        )
+    return [*found, *torque_loop_warnings(plan, asked)]
+
+
+def torque_loop_warnings(plan: Plan, asked: Asked) -> list[str]:
+    """Returns a line if the torque loop of a robot diverges, or nearly, at the speed that is asked of it."""
+    q = torque_loop_numbers(plan, asked)
+    slow = [at for at, each in enumerate(q) if each >= NEAR]
+    if not slow:
+        return []
+    worst = max(slow, key=lambda at: q[at])
+    robot, speed = plan.robots[worst], asked.speeds[worst]
+    does = "diverges" if q[worst] >= EDGE else "hardly settles"
+    return [
+        f"periods.torque = {robot.torque_period_ns / 1e9:g}: the torque loop of {_named(plan, worst, len(slow))} {does} at the "
+        f"{speed:.3g} m/s that are asked of it; it must be well below 2 offset/speed = {2 * abs(robot.offset) / speed:.3g} s"
+    ]
+
+
+def torque_loop_diverges(plan: Plan, asked: Asked) -> bool:
+    """True if the torque loop of some robot diverges at the speed that is asked of it."""
+    return max(torque_loop_numbers(plan, asked)) >= EDGE
+
+
+def torque_loop_numbers(plan: Plan, asked: Asked) -> list[float]:
+    """Returns q = h v/d of each robot at the speed that is asked of it."""
+    return [
+        robot.torque_period_ns * 1e-9 * speed / abs(robot.offset)
+        for robot, speed in zip(plan.robots, asked.speeds.tolist(), strict=True)
+    ]
+
+
+def _start_torque(robot: RobotPlan, ax: float, ay: float) -> float:
+    """Returns the larger torque of both wheels [N m] that an acceleration takes from rest; infinite if that is no number."""
+    try:
+        torques = make_inverse(robot)(state_at(*robot.start, robot.heading, 0.0, 0.0), ax, ay, 0.0)
+    except (ValueError, OverflowError):
+        return float("inf")
+    return max(map(abs, torques))
+
+
+def _named(plan: Plan, worst: int, count: int) -> str:
+    """Returns a robot's name, and of how many it is the worst."""
+    return plan.robots[worst].name + (f" (the worst of {count} robots)" if count > 1 else "")

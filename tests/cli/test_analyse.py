@@ -1,0 +1,170 @@
+"""`echelon analyse`: what it says of a scenario's links, held against runs; what it refuses; `validate` and its warnings."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from echelon.cli.new_scenario import scenario_text, sizes
+from echelon.sim.engines.in_process import Engine
+from echelon.sim.parts.loading import parse
+from echelon.sim.results.block_series import block_series
+from echelon.sim.results.trace import TraceBuilder
+from support.runs import echelon
+
+FOUR = """\
+name = "four"
+duration = 20.0
+[robot]
+mass = 4.0
+inertia = 0.12
+wheel_radius = 0.05
+arm = 0.15
+offset = 0.1
+[formation.groups.g1]
+shape = { kind = "polygon", side = 1.0 }
+[formation.groups.g1.robots]
+a = { start = [0.0, 0.0] }
+b = { start = [1.2, 0.0] }
+c = { start = [1.0, 1.3] }
+d = { start = [-0.1, 0.8] }
+[trajectory]
+kind = "line"
+velocity = [0.2, 0.0]
+"""
+
+
+def last_errors(text: str, *overrides: str) -> list[float]:
+    """Returns the largest error of any block in each quarter of a run in this process; NaN where robots were lost."""
+    _, plan = parse(text, "t.toml", overrides)
+    builder = TraceBuilder(plan)
+    with np.errstate(all="ignore"):
+        Engine(plan, builder.add).run()
+        norms = np.max([series.norm for series in block_series(builder.build()).series], axis=0)
+    return [float(part.max()) for part in np.array_split(norms, 4)]
+
+
+def test_the_first_line_says_of_which_channels_and_periods_it_speaks() -> None:
+    first, *rest = echelon("analyse", "multi").stdout.splitlines()
+    assert first == (
+        "multi: channels state, group_state, reference and command; accelerations every 2 ms, torques every 1 ms"
+    )
+    assert rest[0] == "  delays of the scenario's links: none; none of them loses anything"
+
+
+def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_milliseconds() -> None:
+    done = echelon("analyse", "paper", "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["settles"]
+    assert facts["later"]["state"] == {
+        "seconds": pytest.approx(0.006),
+        "ticks": 6,
+        "tick": pytest.approx(0.001),
+        "ends": "unstable",
+    }
+    assert list(facts["later"]) == list(facts["delays"]) == ["state", "group_state", "reference", "command"]
+    margins = [facts["blocks"][name]["delay_margin"] for name in ("g1", "inter", "centroid")]
+    assert margins == pytest.approx([0.0071117, 0.071117, 0.71117], rel=1e-4)
+
+
+def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
+    """A new scenario with 0.2 s on every link does not settle, nor does its run; with half of that both do."""
+    text = scenario_text("new", sizes("2x3"), None)
+    for delay, settles in ((0.2, False), (0.1, True)):
+        rule = f"links=[{{delay={delay}}}]"
+        done = echelon("analyse", "-", "--set", rule, "--json", typed=text)
+        facts = json.loads(done.stdout)
+        assert (done.returncode, facts["settles"]) == (0 if settles else 1, settles)
+        assert facts["delays"] == {channel: [delay] for channel in ("state", "group_state", "reference", "command")}
+        assert bool(facts["later"]) == settles
+        ends = last_errors(
+            text,
+            rule,
+            "claims=[]",
+            "duration=20.0",
+            "avoidance.enabled=false",
+            "robot.torque_limit=inf",
+            "robot.torque_rate_limit=inf",
+            "robot.wheel_speed_limit=inf",
+        )
+        assert (ends[-1] < 0.1 * ends[0]) == settles, ends
+    lines = echelon("analyse", "-", "--set", "links=[{delay=0.2}]", typed=text).stdout.splitlines()
+    assert "state 200 ms, group_state 200 ms, reference 200 ms, command 200 ms" in lines[1]
+    assert "does not settle; errors grow e-fold in" in lines[-1]
+    assert not any("may be later" in line for line in lines)
+
+
+def test_the_lab_bears_a_tenth_of_a_second_on_every_link() -> None:
+    facts = json.loads(echelon("analyse", "lab", "--set", "links=[{delay=0.1}]", "--json").stdout)
+    assert facts["settles"]
+    assert facts["centroid_age"] == pytest.approx(0.2)
+    assert facts["later"]["command"]["seconds"] == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(
+    ("rule", "named"),
+    [
+        ('{channel="state", loss=0.1}', "9 state links lose 10 % of their messages"),
+        ('{source="g1/r1", delay={min=0.0, max=0.02}}', "1 state links have delays from 0 to 0.02 s"),
+        (
+            '{channel="command", loss=0.5, delay={min=0.01, max=0.02}}',
+            "9 command links lose 50 % of their messages and have delays from 0.01 to 0.02 s",
+        ),
+    ],
+)
+def test_links_that_are_not_treated_are_named_and_no_margin_is_printed(rule: str, named: str) -> None:
+    done = echelon("analyse", "lab", "--set", f"links=[{rule}]")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert (
+        done.stderr
+        == f"echelon: lab: cannot be analysed, only run: {named}: only constant delays without loss are treated\n"
+    )
+
+
+def test_messages_older_than_their_timeout_are_named() -> None:
+    done = echelon("analyse", "drives", "--set", 'links=[{channel="state", delay=0.15}]')
+    assert done.returncode == 2
+    assert "state from g1/r1 to g1 is 0.15 s old when it would be used, more than its timeout of 0.1 s" in done.stderr
+
+
+def test_delays_too_long_to_compute_with_are_refused_at_once() -> None:
+    done = echelon("analyse", "lab", "--set", "links=[{delay=100.0}]", timeout=60)
+    assert done.returncode == 2
+    assert "too many to compute with" in done.stderr
+
+
+def test_margins_of_matrix_gains_are_those_of_the_worst_direction() -> None:
+    gains = 'law.gains=[{block="centroid", k1=[[1.0, 0.0], [0.0, 9.0]], k2=[[1.0, 0.0], [0.0, 3.0]]}]'
+    facts = json.loads(echelon("analyse", "lab", "--set", gains, "--json").stdout)
+    assert facts["blocks"]["centroid"]["delay_margin"] == pytest.approx(0.71117 / 3, rel=1e-4)
+
+
+def test_a_torque_loop_that_loses_robots_is_said_and_is_exit_code_1() -> None:
+    done = echelon("analyse", "paper", "--set", "periods.torque=0.001")
+    assert done.returncode == 1
+    assert "but periods.torque = 0.001: the torque loop of g3/r9" in done.stdout
+    assert "may be later" not in done.stdout
+
+
+# Warnings of `validate`
+
+
+def test_defaults_give_a_tame_run(tmp_path: Path) -> None:
+    (tmp_path / "four.toml").write_text(FOUR)
+    assert echelon("validate", "four.toml", "--strict", cwd=tmp_path).returncode == 0
+    ends = last_errors(FOUR)
+    assert ends[-1] < 1e-3 < ends[0]
+
+
+def test_warnings_are_a_line_each_and_a_mistake_only_where_that_is_wanted() -> None:
+    options = ("--set", "law.epsilon=[0.1,0.1]")
+    done = echelon("validate", "-", *options, typed=FOUR)
+    assert done.returncode == 0
+    warnings = [line for line in done.stdout.splitlines() if line.startswith("  warning  ")]
+    assert [line.split(":")[0].split()[1] for line in warnings] == ["law.epsilon", "periods.torque"]
+    assert not np.isfinite(last_errors(FOUR, "law.epsilon=[0.1,0.1]", "duration=0.1")[-1])
+    strict = echelon("validate", "-", "--strict", "--json", *options, typed=FOUR)
+    assert strict.returncode == 2
+    assert [f"  warning  {line}" for line in json.loads(strict.stdout)["warnings"]] == warnings

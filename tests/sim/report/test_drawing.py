@@ -1,0 +1,104 @@
+"""How figures look: time where the action is, words beside curves, a second cue beside colour."""
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from echelon.bridge.protocols.registry import protocol_of
+from echelon.sim.report.comparison import longest
+from echelon.sim.report.drawing import GROUPS, RUNS, Look, TimeAxis
+from echelon.sim.report.figures import PEAKS, TAUS, TorqueScale, distance_time, errors, torque_time
+from echelon.sim.report.torque_steps import steps_text
+from echelon.sim.results.block_series import block_series
+from echelon.sim.results.distances import distances
+from echelon.sim.results.trace import Trace
+from support.runs import plan_of, trace_of
+from support.synthetic import decaying
+
+
+@pytest.fixture(scope="module")
+def lab() -> Trace:
+    return trace_of(plan_of("lab"))
+
+
+def test_time_is_logarithmic_only_where_blocks_answer_on_scales_far_apart(lab: Trace) -> None:
+    paper = plan_of("paper")
+    times_ns = np.arange(0, 12_000_000_001, 1_000_000)
+    assert TimeAxis.of(paper, times_ns) == TimeAxis(True, 0.001, 12.0, 12.0)
+    assert not TimeAxis.of(paper, times_ns[:200]).log  # it ends before the scales part
+    assert TimeAxis.of(lab.plan, lab.times_ns[0]) == TimeAxis(False, 0.01, 40.0, 40.0)
+
+
+def test_figures_of_torque_and_distance_end_when_all_is_calm(lab: Trace) -> None:
+    time, limit = torque_time(lab), TorqueScale.of([lab]).limit
+    taus = np.stack([states[:, TAUS] for states in lab.states])
+    assert time.last < 10 < time.end == 40
+    later = lab.times_ns[0] / 1e9 > time.last
+    assert np.abs(taus[:, later]).max() < 0.02 * limit < np.abs(taus[:, lab.times_ns[0] / 1e9 > time.last / 2]).max()
+    near = distances(lab)
+    ends = distance_time(near, lab.plan).last
+    assert ends < 10
+    assert np.ptp(near.smallest[near.times_ns / 1e9 > ends]) < 0.04 * near.smallest[-1]
+    shown, _ = time.thin(lab.times_ns[0], lab.states[0][:, 0])
+    assert shown[-1] == time.last
+
+
+def test_a_run_that_never_calms_is_shown_whole() -> None:
+    time = TimeAxis(False, 0.01, 40.0, 40.0)
+    assert time.until(39.0) == time.until(0.0) == time.until(20.0) == time
+    assert time.until(3.9).last == 5.0
+    assert TimeAxis(True, 0.01, 40.0, 40.0).until(3.9).last == 40.0
+    assert longest([time.until(3.9), TimeAxis(False, 0.01, 9.0, 9.0)]) == TimeAxis(False, 0.01, 9.0, 40.0)
+
+
+def test_torque_is_logarithmic_only_where_peaks_dwarf_the_rest(lab: Trace) -> None:
+    peaked = [states.copy() for states in lab.states]
+    peaked[0][3, TAUS[0]] = peaked[0][3, PEAKS[0]] = 1e4
+    assert TorqueScale.of([Trace(lab.plan, lab.times_ns, tuple(peaked))]).linear is not None
+    steady = tuple(np.full_like(states, 0.5) for states in lab.states)
+    assert TorqueScale.of([Trace(lab.plan, lab.times_ns, steady)]).linear is None
+
+
+@pytest.mark.parametrize("of", [Look.of_group, Look.of_run])
+def test_colour_is_not_the_only_cue(of) -> None:
+    looks = [of(number) for number in range(len(GROUPS))]
+    assert len(GROUPS) == len(RUNS)
+    for kind in ("colour", "dashes", "mark"):
+        assert len({getattr(look, kind) for look in looks}) == len(looks)
+
+
+@pytest.mark.parametrize("width", [11.5, 5.6])
+def test_words_of_claims_are_above_the_curves_and_apart(width: float) -> None:
+    claims = ", ".join(f"{{block='{block}', settled_by={by}}}" for block, by in (
+        ("g1", 0.9), ("g2", 1.0), ("g3", 1.05), ("inter", 1.1), ("centroid", 3.0),
+    ))  # fmt: skip
+    run = decaying(["duration=3.0", f"claims=[{claims}]"])
+    figure = Figure(figsize=(width, 3.5), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    errors(block_series(run.trace), run.plan, width).draw(figure)
+    canvas.draw()
+    (axes,) = figure.axes
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert [text.get_text() for text in axes.texts][-1] == "centroid by 3 s"
+    assert len(boxes) == 5
+    assert all(box.y0 >= axes.bbox.y1 for box in boxes)
+    assert all(box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height for box in boxes)
+    assert not any(one.overlaps(other) for at, one in enumerate(boxes) for other in boxes[:at])
+
+
+def test_torques_that_step_by_the_resolution_of_their_frames_are_told() -> None:
+    plan = plan_of("drives")
+    times_ns = tuple(np.arange(0, 1_000_000_000, 10_000_000) for _ in plan.robots)
+    still = [np.zeros((100, 20)) for _ in plan.robots]
+    assert steps_text(Trace(plan, times_ns, tuple(still))) == ""
+    for robot in plan.robots:
+        step = protocol_of(robot).resolution(robot.drive)
+        still[robot.index][::2, TAUS[1]] = step
+    text = steps_text(Trace(plan, times_ns, tuple(still)))
+    assert text.startswith(
+        "The frames of g1/r1, g1/r2, g1/r3, g3/r7, g3/r8, and 1 more carry torque in steps of 0.001 N m"
+    )
+    assert "g2/r4" not in text  # floating point
+    mirrored = plan_of("lab")
+    assert steps_text(Trace(mirrored, times_ns, tuple(still))) == ""

@@ -1,0 +1,76 @@
+"""Robots that are points, which do exactly what accelerations ask: the in-process engine with such robots is the brute force
+that predictions are held against."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import echelon.sim.engines.in_process
+from echelon.controller.trajectory import Line
+from echelon.messages import STATE_FIELDS, Channel, Heard, Message
+from echelon.plan.layout import with_message_sizes
+from echelon.plan.plan import Array, Plan
+from echelon.plugins import Part
+from echelon.role import Input, Stage
+from echelon.runtime.turns import Turn
+from echelon.sim.engines.in_process import Engine
+from support.growth import growth
+
+
+class PointRobot:
+    """A double integrator as a role."""
+
+    def __init__(self, plan: Plan, index: int) -> None:
+        robot = plan.robots[index]
+        self.index, self._plan = index, robot
+        self.p, self.v = np.array(robot.start), np.zeros(2)
+        self._mine = slice(2 * robot.child_number, 2 * robot.child_number + 2)
+        self.stages = (
+            Stage(Turn.SAY, robot.period_ns, (), self._say),
+            Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
+        )
+
+    def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        values = np.zeros(len(STATE_FIELDS))
+        values[:4] = *self.p, *self.v
+        return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
+
+    def _move(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        T, a = self._plan.period_ns * 1e-9, np.zeros(2) if heard[0] is None else heard[0].values[self._mine]
+        self.p, self.v = self.p + T * self.v + T**2 / 2 * a, self.v + T * a
+        return ()
+
+
+def at_rest(plan: Plan) -> Plan:
+    """Returns a plan that wants all robots at the origin, at rest, without avoidance: its run is linear."""
+    nodes = tuple(
+        replace(node, shape=replace(node.shape, points=tuple((0.0, 0.0) for _ in node.shape.points)))
+        for node in plan.nodes
+    )
+    rest = Part("line", {}, None, Line(velocity=(0.0, 0.0)))
+    return with_message_sizes(
+        replace(plan, nodes=nodes, trajectory=rest, avoidance=replace(plan.avoidance, enabled=False))
+    )
+
+
+def point_run(plan: Plan, hyperperiods: int, patch: pytest.MonkeyPatch) -> Array:
+    """Returns (p, T v) of all robots at the beginning of each hyperperiod of the root's period T, (hyperperiods, 4 robots), in
+    a plan that is `at_rest`; shorter if they run away."""
+    period_ns = plan.root.period_ns
+    patch.setattr(echelon.sim.engines.in_process, "make_robot", PointRobot)
+    engine = Engine(replace(plan, duration_ns=hyperperiods * period_ns))
+    robots = [role for role in engine.roles if isinstance(role, PointRobot)]
+    rows = []
+    for time_ns in engine.instants():
+        if time_ns % period_ns == 0:
+            rows.append(np.concatenate([np.concatenate([robot.p, period_ns * 1e-9 * robot.v]) for robot in robots]))
+            if not np.abs(rows[-1]).max() < 1e100:
+                break
+    return np.array(rows)
+
+
+def growth_of_points(plan: Plan, hyperperiods: int, patch: pytest.MonkeyPatch) -> float:
+    """Returns the logarithm of the growth per period of the root, over the second half of a run of points."""
+    return growth(np.linalg.norm(point_run(plan, hyperperiods, patch), axis=1))

@@ -168,7 +168,6 @@ class Picture:
             figure = Figure(figsize=(self.width, self.height), layout="constrained")
             self.draw(figure)
             figure.savefig(file, format=kind, metadata=metadata, **options)
-        figure.clear()
 
 
 def _tidied(svg: str) -> str:

@@ -29,7 +29,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_leaves_its_folder(folder: Path) -> None:
-    names = {".echelon.json", "scenario.toml", "run.mcap", "can.log", "torque.dbc", "summary.json", "report.html"}
+    names = {
+        ".echelon.json",
+        "scenario.toml",
+        "run.json",
+        "run.mcap",
+        "can.log",
+        "torque.dbc",
+        "summary.json",
+        "report.html",
+    }
     assert {file.name for file in folder.iterdir()} == names
     plan = plan_of("paper", "duration=0.2")
     summary = json.loads((folder / "summary.json").read_text())

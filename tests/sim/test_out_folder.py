@@ -43,7 +43,7 @@ def left(lab: Path, tmp_path: Path) -> Path:
 def test_of_an_earlier_run_of_the_same_scenario_nothing_stays(left: Path) -> None:
     (left / "run.mcap.cut").write_text("of a run that was killed")
     assert run(left, "lab", "--can", "none") == (0, "")
-    assert set(files(left)) == {NOTE, "scenario.toml", "run.mcap", "summary.json"}
+    assert set(files(left)) == {NOTE, "scenario.toml", "run.json", "run.mcap", "summary.json"}
 
 
 def test_the_run_of_another_scenario_stays_unless_the_user_says_so(left: Path) -> None:

@@ -4,9 +4,10 @@ It makes every object that a run will need.  An error raises PartRunError: one l
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from echelon.bridge.protocols.checked import Caller
+from echelon.bridge.protocols.frame import WHEELS, Host
 from echelon.bridge.protocols.registry import (
     DrivePlace,
     cyclic_of,
@@ -18,6 +19,11 @@ from echelon.bridge.protocols.registry import (
     shared_protocols,
 )
 from echelon.plan.plan import Plan, RobotPlan
+
+_TRIED: Final = (-20, 30)
+"""Torques of the right and left wheel that a host is given in the trial, in bits; they differ in size and sign"""
+_TRIED_FLOAT: Final = 0.001
+"""What stands for a bit there if torques are floating point [N m]"""
 
 
 def try_protocols(plan: Plan) -> None:
@@ -32,11 +38,16 @@ def try_protocols(plan: Plan) -> None:
 
 
 def _try_robot(plan: Plan, robot: RobotPlan) -> None:
+    from echelon.bridge.protocols.plan_dbc import (
+        identifiers,
+    )  # imports cantools, which the built-in protocols do not need
+
     caller, protocol, drive = Caller.of(robot), protocol_of(robot), robot.drive
-    make_host(robot).mirror(0.0, 0.0, True)
+    host = make_host(robot)
     for wheels in protocol.wheels:
         make_drive(plan, DrivePlace(robot.index, wheels, drive.bus, 1))
-    messages = _messages(caller, "messages", protocol.messages, drive, "robot")
+    name, *_ = identifiers([robot.path])
+    messages = _messages(caller, "messages", protocol.messages, drive, name)
     for one in shared_protocols(plan):
         if one.part.use == drive.protocol.use:
             times = one.period_ns, one.watchdog_ns
@@ -47,7 +58,8 @@ def _try_robot(plan: Plan, robot: RobotPlan) -> None:
         observer = make_observer(robot, closed)
         _check_described(caller, "observer", set(cyclic_of(robot, observer, closed)), messages)
     caller.call("messages", _written, messages)
-    _number(caller, "resolution", caller.call("resolution", protocol.resolution, drive))
+    _number(caller, "resolution", resolution := caller.call("resolution", protocol.resolution, drive))
+    _check_torques(caller, host, messages, resolution)
     caller.call("boot_ups", lambda: dict(protocol.boot_ups(drive)))
     _check_addresses(caller, caller.call("addresses", protocol.addresses, drive))
 
@@ -67,6 +79,32 @@ def _check_described(caller: Caller, what: str, cyclic: set[int], messages: list
     """Raises PartRunError if a cyclic identifier has no DBC message, from which the load of a bus is computed."""
     if lacking := sorted(cyclic - {message.frame_id for message in messages}):
         raise caller.wrong(f"{what}: identifier {lacking[0]:#05x} comes regularly, but `messages` does not describe it")
+
+
+def _check_torques(caller: Caller, host: Host, messages: list[Any], resolution: float) -> None:
+    """Raises PartRunError if the signals tau_right and tau_left [N m] of a command's DBC message differ from the torques.
+
+    A protocol that names or scales its signals otherwise is not checked."""
+    right, left = (bits * (resolution or _TRIED_FLOAT) for bits in _TRIED)
+    described = {message.frame_id: message for message in messages}
+    for frame in host.mirror(right, left, True):
+        message = described.get(frame.can_id)
+        if message is None or message.is_multiplexed():
+            continue
+        signals = {signal.name: signal for signal in message.signals}
+        for wheel, torque in zip(WHEELS, (right, left), strict=True):
+            signal = signals.get(f"tau_{wheel}")
+            if signal is None or signal.unit not in (None, "Nm", "N m", "N.m"):
+                continue
+            if len(frame.data) < message.length:
+                raise caller.wrong(
+                    f"{message.name}: its DBC describes {message.length} bytes where encode returned {len(frame.data)}"
+                )
+            read = message.decode(frame.data, decode_choices=False)[signal.name]
+            if not abs(read - torque) <= resolution + 1e-6:
+                raise caller.wrong(
+                    f"{message.name}: its DBC reads {signal.name} = {read:.6g} where encode was given {torque:.6g}"
+                )
 
 
 def _check_addresses(caller: Caller, found: Any) -> None:

@@ -199,6 +199,25 @@ def test_what_returns_no_frames_is_named(folder: Path, change: tuple[str, str], 
     assert says in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [('Struct("<hhB")', 'Struct(">hhB")'), ('"tau_right", 0', '"tau_right", 7'),
+         ('"tau_left", 16', '"tau_left", 23'),
+         ('drive.torque_scale, "Nm"', 'drive.torque_scale, "Nm", big_endian=True')],
+        [('"tau_right", 0', '"right", 0'), ('"tau_left", 16', '"left", 16'),
+         ('drive.torque_scale, "Nm"', '3 * drive.torque_scale, "Nm"')],
+        [('drive.torque_scale, "Nm"', '1000 * drive.torque_scale, "mNm"')],
+    ],
+    ids=["big endian", "other names", "other unit"],
+)  # fmt: skip
+def test_a_dbc_that_fits_or_names_its_signals_otherwise_is_not_refused(
+    folder: Path, changes: list[tuple[str, str]]
+) -> None:
+    _, plan = load(changed(folder, *changes))
+    assert "BO_ 768 torque_r1: 5 bridge" in plan_dbc(plan)
+
+
 HOST = "    def host(self, drive: DrivePlan) -> MyHost:\n        return MyHost(drive, [FEEDBACK + drive.node_ids[0]])\n"
 
 
@@ -222,11 +241,15 @@ HOST = "    def host(self, drive: DrivePlan) -> MyHost:\n        return MyHost(d
         ("        return [\n            Message(COMMAND", "        return [] and [\n            Message(COMMAND",
          "observer: identifier 0x300 comes regularly, but `messages` does not describe it"),
         ('("tau_left", 16)', '("tau_left", 8)', "messages raised Error: The signals tau_left and tau_right are overlapping"),
+        ('Struct("<hhB")', 'Struct(">hhB")', "r1: torque_r1: its DBC reads tau_right = -4.865 where encode was given -0.02"),
+        ('drive.torque_scale, "Nm"', '2 * drive.torque_scale, "Nm"', "its DBC reads tau_right = -0.04 where encode"),
+        ('"tau_left", 16)', '"tau_left", 40)', "torque_r1: its DBC describes 8 bytes where encode returned 5"),
         ("return MyObserver(drive,", "return 7, (drive,", "what observer returns lacks cyclic, identifiers, observe, wheels"),
     ],
 )  # fmt: skip
 def test_what_is_missing_or_wrong_is_said_before_the_start(folder: Path, old: str, new: str, says: str) -> None:
-    scenario = changed(folder, (old, new))
+    size = [("size = drive.node_ids[0], BODY.size", "size = drive.node_ids[0], 8")] if "8 bytes" in says else []
+    scenario = changed(folder, (old, new), *size)
     sets = ["robot.drive.node_ids=[1,2]"] if "twice" in says else []
     with pytest.raises(ScenarioError) as caught:
         load(scenario, sets)

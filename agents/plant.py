@@ -236,18 +236,19 @@ def make_step(robot: RobotPlan) -> Step:
     plant: Plant = robot.model.made
     if robot.model.is_own:
         return plant.step_of(robot)
-    who = f"{robot.model.use} of {robot.name}"
     try:
         step = plant.step_of(robot)
     except Exception as error:
-        raise PartRunError(f"{who}: step_of raised {type(error).__name__}: {error}") from error
-    return _checked(step, who)
+        raise robot.model.raised(f" of {robot.name}", "step_of", error) from error
+    return _checked(step, robot)
 
 
-def _checked(step: Step, who: str) -> Step:
+def _checked(step: Step, robot: RobotPlan) -> Step:
     """Returns a step with its answers checked: it raises PartRunError if `step` raises, or returns anything but a state of
     finite numbers.  In a run that has diverged (inputs from `_HUGE` on) the step may raise ValueError or OverflowError, or
     return numbers that are not finite."""
+
+    who = f"{robot.model.use} of {robot.name}"
 
     def checked(state: RobotState, tau_right: float, tau_left: float, h: float) -> RobotState:
         given = (*state, tau_right, tau_left)
@@ -257,7 +258,7 @@ def _checked(step: Step, who: str) -> Step:
         except Exception as error:
             if diverged and isinstance(error, (ValueError, OverflowError)):
                 raise
-            raise PartRunError(f"{who}: step raised {type(error).__name__}: {error}") from error
+            raise robot.model.raised(f" of {robot.name}", "step", error) from error
         if not isinstance(after, RobotState):
             raise PartRunError(f"{who}: step must return a RobotState (state_at), not {after!r:.60}")
         if not diverged and not all(map(isfinite, after)):

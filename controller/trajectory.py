@@ -140,7 +140,7 @@ class _Checked:
         try:
             answer = np.asarray(self._part.made.at(t), dtype=np.float64)
         except Exception as error:
-            raise PartRunError(f"{self._part.use}: at({t:g}) raised {type(error).__name__}: {error}") from error
+            raise self._part.raised("", f"at({t:g})", error) from error
         if answer.shape != (3, 2):
             raise PartRunError(f"{self._part.use}: at({t:g}) has the shape {answer.shape}, not (3, 2)")
         if not np.isfinite(answer).all():

@@ -18,11 +18,14 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
 from pathlib import Path
+from traceback import walk_tb
 from types import ModuleType
 from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
+
+from echelon.errors import PartRunError
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -87,6 +90,21 @@ class Part(Generic[T_co]):
     def is_own(self) -> bool:
         """True if the part belongs to this package, so that its answers need no check."""
         return type(self.made).__module__.startswith("echelon.")
+
+    def calls_in(self, error: BaseException) -> list[tuple[str, int]]:
+        """Returns the calls in an error's traceback that are in the part's own module: function and line, innermost last."""
+        module = type(self.made).__module__
+        found = walk_tb(error.__traceback__)
+        return [(frame.f_code.co_name, line) for frame, line in found if frame.f_globals.get("__name__") == module]
+
+    def raised(self, whom: str, what: str, error: Exception) -> PartRunError:
+        """Returns the error for a call of the part that raised: the line of its file where it raised, and what.
+
+        `what` names the call, and `whom` says for what it was made (" of block g1")."""
+        who, calls = self.use, self.calls_in(error)
+        if self.source is not None and calls:
+            who = f"{self.source.name}, line {calls[-1][1]}: {type(self.made).__name__}"
+        return PartRunError(f"{who}{whom}: {what} raised {_error_text(error)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the source in place of the object: the process that unpickles a plan runs the file's text itself."""

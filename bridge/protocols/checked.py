@@ -16,6 +16,7 @@ from inspect import get_annotations
 from math import isfinite
 from typing import Any, Self
 
+from echelon.bridge.protocols.cyclic import CyclicHost
 from echelon.bridge.protocols.frame import Drive, Frame, Host, Master
 from echelon.bridge.protocols.motor import Fault, Motor
 from echelon.bridge.protocols.observe import Finding, Observer, WheelReading
@@ -28,10 +29,10 @@ from echelon.plugins import Part
 class Caller:
     """Calls the code of a user's own protocol.
 
-    `who` names it in error messages; `allowed` are the identifiers of the frames that it may send."""
+    Errors name the protocol and `whom` (" of r1"); `allowed` are the identifiers of the frames that it may send."""
 
-    def __init__(self, who: str, allowed: frozenset[int]) -> None:
-        self.who, self.allowed = who, allowed
+    def __init__(self, part: Part[Any], whom: str, allowed: frozenset[int]) -> None:
+        self.part, self.whom, self.allowed = part, whom, allowed
 
     @classmethod
     def of(cls, robot: RobotPlan) -> Self:
@@ -39,19 +40,23 @@ class Caller:
         part, nodes = robot.drive.protocol, robot.drive.node_ids
         protocol: DriveProtocol = part.made
         allowed = protocol.shared_identifiers().union(*(protocol.identifiers(node) for node in nodes))
-        return cls(f"{part.use} of {robot.name}", allowed)
+        return cls(part, f" of {robot.name}", allowed)
 
     def wrong(self, text: str) -> PartRunError:
         """Returns the error with this text."""
-        return PartRunError(f"{self.who}: {text}")
+        return PartRunError(f"{self.part.use}{self.whom}: {text}")
 
     def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Calls a function and returns its result; `what` names the function in errors."""
+        """Calls a function and returns its result; `what` names the function in errors.
+
+        If that function is a method of a base class, the error names the method of the protocol that it called."""
         try:
             return function(*arguments)
         except Exception as error:
-            text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            raise self.wrong(f"{what} raised {text}") from error
+            whose, s, _ = what.rpartition("'s ")
+            if s and (calls := self.part.calls_in(error)):
+                what = f"{whose}{s}{calls[0][0]}"
+            raise self.part.raised(self.whom, what, error) from error
 
     def make(self, what: str, interface: type, function: Callable[..., Any], *arguments: Any) -> Any:
         """Calls a function that makes an object, and returns it if it has all attributes of an interface."""
@@ -139,7 +144,10 @@ class CheckedHost:
         return self._frames("mirror", tau_right, tau_left, enable, saturated)
 
     def _frames(self, method: str, *arguments: Any) -> list[Frame]:
-        frames = self._caller.frames(f"its host's {method}", getattr(self._host, method), *arguments)
+        kind, name = type(self._host), method
+        if isinstance(self._host, CyclicHost) and getattr(kind, method) is getattr(CyclicHost, method):
+            name = "encode"  # the frames are what this method of the protocol returned
+        frames = self._caller.frames(f"its host's {name}", getattr(self._host, method), *arguments)
         self._read(method)
         return frames
 
@@ -243,7 +251,7 @@ class CheckedMaster:
     @classmethod
     def made_by(cls, part: Part[Any], period_ns: int, watchdog_ns: int) -> Self | None:
         """Returns the master that a protocol makes, or None if it has none."""
-        caller = Caller(part.use, part.made.shared_identifiers())
+        caller = Caller(part, "", part.made.shared_identifiers())
         if caller.call("master", part.made.master, period_ns, watchdog_ns) is None:
             return None
         return cls(caller, caller.make("master", Master, part.made.master, period_ns, watchdog_ns))

@@ -120,12 +120,11 @@ def make_nu(part: Part[Any], block: Block) -> Nu:
     law: Law = part.made
     if part.is_own:
         return law.nu_of(block)
-    who = f"{part.use} of block {block.name}"
     try:
         nu = law.nu_of(block)
     except Exception as error:
-        raise PartRunError(f"{who}: nu_of raised {type(error).__name__}: {error}") from error
-    return _checked(nu, block.size, who)
+        raise part.raised(f" of block {block.name}", "nu_of", error) from error
+    return _checked(nu, part, block)
 
 
 def make_state(part: Part[Any], block: Block) -> Array:
@@ -135,7 +134,7 @@ def make_state(part: Part[Any], block: Block) -> Array:
     try:
         size = law.state_size(block)
     except Exception as error:
-        raise PartRunError(f"{who}: state_size raised {type(error).__name__}: {error}") from error
+        raise part.raised(f" of block {block.name}", "state_size", error) from error
     if not isinstance(size, int) or size < 0:
         raise PartRunError(f"{who}: state_size must be a whole number that is not negative, not {size!r:.60}")
     return np.zeros(size)
@@ -148,7 +147,7 @@ def make_weight(part: Part[Any], block: Block) -> Array:
     try:
         weight = np.asarray(law.weight(block), dtype=np.float64)
     except Exception as error:
-        raise PartRunError(f"{who}: weight raised {type(error).__name__}: {error}") from error
+        raise part.raised(f" of block {block.name}", "weight", error) from error
     if weight.shape != shape:
         raise PartRunError(f"{who}: weight has the shape {weight.shape}, not {shape}")
     if not np.isfinite(weight).all():
@@ -156,9 +155,11 @@ def make_weight(part: Part[Any], block: Block) -> Array:
     return weight
 
 
-def _checked(nu: Nu, size: int, who: str) -> Nu:
+def _checked(nu: Nu, part: Part[Any], block: Block) -> Nu:
     """Returns `nu` with its answers checked: it raises PartRunError if `nu` raises, or returns anything but `size` finite
     numbers.  In a run that has diverged (inputs from `_HUGE` on) `nu` may fail; then the answer is NaN."""
+
+    who, size = f"{part.use} of block {block.name}", block.size
 
     def checked(t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
         diverged = not all(np.abs(given).max() < _HUGE for given in (e, e_dot, feed_forward))
@@ -168,7 +169,7 @@ def _checked(nu: Nu, size: int, who: str) -> Nu:
         except Exception as error:
             if diverged:
                 return np.full(size, np.nan)
-            raise PartRunError(f"{who}: nu at t = {t:g} s raised {type(error).__name__}: {error}") from error
+            raise part.raised(f" of block {block.name}", f"nu at t = {t:g} s", error) from error
         if given is None:
             raise PartRunError(f"{who}: nu at t = {t:g} s returned nothing; it must return {size} numbers")
         if answer.shape != (size,):

@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.agents.plant import make_step, state_at
 from echelon.controller.laws.law import Block, law_block, make_nu, make_state, make_weight
-from echelon.controller.trajectory import make_trajectory
+from echelon.controller.trajectory import Desired, make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.errors import PartRunError
 from echelon.plan.plan import Array, Plan, RobotPlan
@@ -25,6 +25,14 @@ PATIENCE_S: Final = 2.0
 INSTANTS: Final = 100
 """How many instants, spread over the run, a trajectory is tried at, as far as they take no longer than `INSTANTS_S` [s]"""
 INSTANTS_S: Final = 0.5
+SLOPES: Final = 25
+"""At how many instants the derivatives of a trajectory are compared with its differences, within `INSTANTS_S` more"""
+SLOPE_STEP_S: Final = 1e-3
+"""Central differences reach from so long before an instant to as long after it [s]"""
+SLOPE_TOLERANCE: Final = 0.1
+"""By this share of its largest value a derivative may differ, and by `SLOPE_FLOOR` [m/s, m/s²]; an error in a derivative is
+larger as a rule, and an honest path is far closer, except at its corners"""
+SLOPE_FLOOR: Final = 1e-3
 _T = TypeVar("_T")
 
 
@@ -57,6 +65,36 @@ def _probe_trajectory(plan: Plan) -> None:
         if number > 1 and time.monotonic() - begun_s > INSTANTS_S:
             break
         _asked(f"{plan.trajectory.use}: at({t:g})", partial(trajectory.at, t))
+    _probe_slopes(plan.trajectory.use, trajectory, end_s)
+
+
+def _probe_slopes(use: str, trajectory: Desired, end_s: float) -> None:
+    """Compares velocity and acceleration with central differences of position and velocity.
+
+    Raises PartRunError if they differ at half of the instants or more: at a corner of an honest path they differ too."""
+    step_s, begun_s = min(SLOPE_STEP_S, end_s / 100), time.monotonic()
+    times, given, found = [], [], []
+    for number in range(SLOPES):
+        if number and time.monotonic() - begun_s > INSTANTS_S:
+            break
+        t = (number + 0.382) / SLOPES * end_s  # between round numbers, where paths have their corners
+        ask = (partial(trajectory.at, at) for at in (t - step_s, t, t + step_s))
+        before, now, after = (_asked(f"{use}: at({t:g})", one) for one in ask)
+        times.append(t)
+        given.append(now[1:] + 0.0)  # no -0
+        found.append((after - before)[:2] / (2 * step_s))
+    wrong = np.abs(np.array(given) - found)  # (instants, 2, 2): velocity and acceleration, x and y
+    largest = np.abs(given).max(axis=(0, 2))
+    too_far = wrong > SLOPE_FLOOR + SLOPE_TOLERANCE * largest[:, np.newaxis]
+    for row, (what, of, unit) in enumerate((("velocity", "position", "m/s"), ("acceleration", "velocity", "m/s²"))):
+        instants = np.flatnonzero(too_far[:, row].any(axis=1))
+        if 2 * len(instants) >= len(times):
+            at = instants[0]
+            axis = int(wrong[at, row].argmax())
+            raise PartRunError(
+                f"{use}: at t = {times[at]:.3g} s: {what} is not the derivative of {of} "
+                f"(in {'xy'[axis]} {given[at][row, axis]:.3g} against {found[at][row, axis]:.3g} {unit})"
+            )
 
 
 def _probe_law(plan: Plan) -> None:

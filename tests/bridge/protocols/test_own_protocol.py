@@ -1,5 +1,6 @@
 """A user's drive protocol in a file beside the scenario: the example runs, and a wrong one causes one line that names it."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from echelon.bridge.protocols.registry import make_drive, make_host, make_observ
 from echelon.errors import PartRunError
 from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError
+from echelon.planning.loading import load as load_untried
 from echelon.sim.engines.in_process import Engine
-from echelon.sim.parts.loading import load
+from echelon.sim.parts.loading import REGISTRY, load
 from support.runs import EXAMPLES, echelon, reasons, summary_of
 
 TEXT = (EXAMPLES / "my_drive.py").read_text()
@@ -110,7 +112,7 @@ def test_what_fails_in_a_run_is_one_line_and_wheels_are_stopped_first(
     done = echelon("run", scenario, "--engine", engine, *QUIET, "--out", tmp_path / "run")
     assert done.returncode == 3
     (line,) = done.stderr.splitlines()
-    assert f"my_drive.py:MyProtocol of r1: {says}" in line
+    assert re.search(rf"my_drive\.py(:|, line \d+: )MyProtocol of r1: {says}", line)
     frames = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log")]
     assert [(frame.can_id, frame.data) for frame in frames[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
     assert any(says in reason for reason in reasons(summary_of(tmp_path / "run")))
@@ -122,7 +124,7 @@ def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Pa
     sets = ("--set", "claims=[]", "--set", "can.watchdog=0.5")
     done = echelon("run", scenario, "--clock", "wall", *sets, *QUIET, "--out", tmp_path / "run")
     assert done.returncode == 3
-    assert "echelon: my_drive.py:MyProtocol of r" in done.stderr
+    assert "echelon: my_drive.py, line 54: MyProtocol of r" in done.stderr
     assert "its host's command raised KeyError: 'w'" in done.stderr
     commands = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log") if frame.can_id < 0x380]
     assert [(frame.can_id, frame.data) for frame in commands[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
@@ -137,7 +139,7 @@ def test_a_host_that_cannot_even_stop_is_made_to_ask_for_no_torque(folder: Path)
     assert commander is not None
     frames, failure = commander.stop(plan.duration_ns)
     assert [timed.frame for timed in frames] == [Frame(0x300 + robot, bytes(5)) for robot in range(3)]
-    assert failure == "my_drive.py:MyProtocol of r1: its host's stop raised RuntimeError: no"
+    assert failure == "my_drive.py, line 54: MyProtocol of r1: its host's stop raised RuntimeError: no"
 
 
 def first(plan: Plan) -> object:
@@ -175,6 +177,16 @@ def observed(plan: Plan) -> object:
             first,
             "its host after receive: torque must be two finite numbers",
         ),
+        (
+            ("        flags = ENABLE", "        1 / 0; flags = ENABLE"),
+            first,
+            "its host's encode raised ZeroDivisionError",
+        ),
+        (
+            ("return [Frame(COMMAND", "return (COMMAND, data) or [Frame(COMMAND"),
+            first,
+            "its host's encode must return a list",
+        ),
         (failing("receive", "1 / 0"), first, "its host's receive raised ZeroDivisionError: division by zero"),
         (failing("advance", "return [Frame(0x381)]", "MyDrive(CyclicDrive)"), advanced, "sends identifier 0x381"),
         (failing("advance", "return []", "MyDrive(CyclicDrive)"), advanced, "though advance(400000000) has done what"),
@@ -191,11 +203,11 @@ def observed(plan: Plan) -> object:
     ],
 )
 def test_what_returns_no_frames_is_named(folder: Path, change: tuple[str, str], ask: object, says: str) -> None:
-    _, plan = load(changed(folder, change))
+    plan = load_untried(changed(folder, change), [], REGISTRY)[1]
     assert callable(ask)
     with pytest.raises(PartRunError) as caught:
         ask(plan)
-    assert str(caught.value).startswith("my_drive.py:MyProtocol of r1: ")
+    assert re.match(r"my_drive\.py(:|, line \d+: )MyProtocol of r1: ", str(caught.value))
     assert says in str(caught.value)
 
 

@@ -63,9 +63,9 @@ LATER = {
     "plant": "if 0.12 < state.v < 0.2:",
 }
 NAMED = {
-    "law": "mine.py:Mine of block g2: nu at t = 0.3 s ",
-    "path": "mine.py:Mine: at(0.3) ",
-    "plant": "mine.py:Mine of g2/r5: step ",
+    "law": "mine.py, line 9: Mine of block g2: nu at t = 0.3 s ",
+    "path": "mine.py, line 7: Mine: at(0.3) ",
+    "plant": "mine.py, line 6: Mine of g2/r5: step ",
 }
 RUNS = {"law": "g2", "path": "coordinator", "plant": "g2/r5"}
 """The role that runs each part"""
@@ -122,7 +122,8 @@ def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
     text = str(caught.value)
     assert time.monotonic() - begun < 4
     assert re.match(
-        rf"{re.escape(str(folder / 'mine.toml'))}: mine\.py:Mine(: at\(0\)| of block g1: nu| of g2/r5: step)", text
+        rf"{re.escape(str(folder / 'mine.toml'))}: mine\.py(:|, line \d+: )Mine(: at\(0\)| of block g1: nu| of g2/r5: step)",
+        text,
     )
     assert (says if isinstance(says, str) else says[kind]) in text
     assert len(text.splitlines()) == 1
@@ -133,9 +134,9 @@ def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
     ("kind", "line", "says"),
     [
         ("law", "if not e.any(): return e / abs(e).sum()", "is not finite: [nan, nan, nan, nan]"),
-        ("law", "if block.name == 'inter': return 1 / 0", "mine.py:Mine of block inter: nu at t = 0 s raised ZeroDivision"),
-        ("path", "if t > 0.9: return 1 / 0", "mine.py:Mine: at(40) raised ZeroDivisionError"),
-        ("plant", "if state.v > 0: return 1 / 0", "mine.py:Mine of g2/r5: step raised ZeroDivisionError"),
+        ("law", "if block.name == 'inter': return 1 / 0", "mine.py, line 9: Mine of block inter: nu at t = 0 s raised Zero"),
+        ("path", "if t > 0.9: return 1 / 0", "mine.py, line 7: Mine: at(40) raised ZeroDivisionError"),
+        ("plant", "if state.v > 0: return 1 / 0", "mine.py, line 6: Mine of g2/r5: step raised ZeroDivisionError"),
     ],
 )  # fmt: skip
 def test_each_block_robot_and_time_is_tried(folder: Path, kind: str, line: str, says: str) -> None:
@@ -144,11 +145,73 @@ def test_each_block_robot_and_time_is_tried(folder: Path, kind: str, line: str, 
     assert says in str(caught.value)
 
 
+SLOPES = """
+import numpy as np
+from echelon import Trajectory
+
+class Circle(Trajectory):
+    factor: float = 1.0
+
+    def at(self, t):
+        k, turn = 0.4, np.array([0.0, np.pi / 2])
+        return np.array([np.sin(k * t + turn), self.factor * k * np.cos(k * t + turn), -k * k * np.sin(k * t + turn)])
+
+class Shake(Trajectory):
+    def at(self, t):
+        k = np.array([3.0, 40.0])
+        return np.array([1000 + np.sin(k * t), k * np.cos(k * t), -(k**2) * np.sin(k * t)])
+
+class Slow(Trajectory):
+    def at(self, t):
+        return np.array([[1e-5 * t**2, 0.0], [2e-5 * t, 0.0], [2e-5, 0.0]])
+
+class Corners(Trajectory):
+    every: float
+
+    def at(self, t):
+        leg, s = divmod(t, self.every)
+        even = leg % 2 == 0
+        x, v = (s, 1.0) if even else (self.every - s, -1.0)
+        return np.array([[x, 0.0], [v, 0.0], [0.0, 0.0]])
+
+class Flat(Circle):
+    def at(self, t):
+        return super().at(t) * np.array([[1.0], [1.0], [0.0]])
+"""
+
+
+def uses_slope(folder: Path, name: str, parameters: str = "") -> str:
+    (folder / "mine.py").write_text(SLOPES)
+    return f'trajectory={{use="mine.py:{name}",parameters={{{parameters}}}}}'
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "says"),
+    [
+        ("Circle", "factor=4.0", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 1.55 against"),
+        ("Circle", "factor=0.0", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 0 against"),
+        ("Flat", "", "acceleration is not the derivative of velocity (in y 0 against -0.155 m/s²)"),
+    ],
+)  # fmt: skip
+def test_a_velocity_that_is_no_derivative_is_a_mistake(folder: Path, name: str, parameters: str, says: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load(folder / "mine.toml", [uses_slope(folder, name, parameters)])
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [("Circle", ""), ("Shake", ""), ("Slow", ""), *(("Corners", f"every={every}") for every in (0.05, 0.1, 1.0, 7.0))],
+)
+def test_honest_trajectories_may_be_fast_slow_and_have_corners(folder: Path, name: str, parameters: str) -> None:
+    load(folder / "mine.toml", [uses_slope(folder, name, parameters)])
+
+
 @pytest.mark.parametrize("command", ["run", "validate"])
 def test_a_mistake_found_by_trying_ends_a_command_with_2(folder: Path, command: str) -> None:
     done = echelon(command, folder / "mine.toml", "--set", write(folder, "law", "1 / 0"))
     assert done.returncode == 2
-    assert "mine.py:Mine of block g1: nu at t = 0 s raised ZeroDivisionError" in one_line(done.stderr)
+    assert "mine.py, line 9: Mine of block g1: nu at t = 0 s raised ZeroDivisionError" in one_line(done.stderr)
 
 
 def test_a_file_that_never_ends_is_a_mistake_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,7 +331,10 @@ def test_a_part_that_cannot_be_made_ends_a_run_in_a_line(folder: Path) -> None:
     (folder / "mine.py").write_text(text)
     done = run(folder, USES["plant"], *WAYS["in process"])
     assert done.returncode == 3
-    assert one_line(done.stderr) == "echelon: mine.py:Mine of g2/r5: step_of raised ZeroDivisionError: division by zero"
+    assert (
+        one_line(done.stderr)
+        == "echelon: mine.py, line 11: Mine of g2/r5: step_of raised ZeroDivisionError: division by zero"
+    )
 
 
 def test_ctrl_c_in_process_still_interrupts(folder: Path) -> None:

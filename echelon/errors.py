@@ -27,11 +27,10 @@ class UsageError(UserError):
     """Arguments of a command that contradict each other, or that need something this machine does not have."""
 
 
-class PartRunError(Exception):
-    """A part from outside this package failed in a run.  The text is one line: the part's file and class, and the failure."""
+class PartRunError(UserError):
+    """A part from outside this package failed in a run.  The text is one line: the part's file and class, and the failure.
 
-    def __init__(self, text: str) -> None:
-        super().__init__(one_line(text))
+    The command line exits with code 3, not 2, since the run had begun."""
 
 
 class Mistakes:

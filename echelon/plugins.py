@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
+from multiprocessing import parent_process
 from pathlib import Path
 from traceback import walk_tb
 from types import ModuleType
@@ -234,6 +235,7 @@ def _module(source: Source) -> ModuleType:
         return sys.modules[name]
     module = ModuleType(name)
     module.__file__ = source.name
+    module.__dict__["print"] = _print
     sys.modules[name] = module  # dataclasses and pydantic look their module up there
     try:
         exec(compile(source.text, source.name, "exec"), module.__dict__)
@@ -246,6 +248,14 @@ def _module(source: Source) -> ModuleType:
             raise
         raise PartError(f"{source.name}: {_error_text(error)}") from None
     return module
+
+
+def _print(*values: object, file: Any = None, **options: Any) -> None:
+    """Is `print` in the files of parts.  Without `file` it writes to the command's standard error, since standard output is
+    for the command's result (`--json`).  In the processes of a run, standard output is the command's standard error."""
+    if file is None:
+        file = sys.stderr if parent_process() is None else sys.stdout
+    print(*values, file=file, **options)
 
 
 def _error_text(error: BaseException) -> str:

@@ -32,7 +32,8 @@ class Simulation:
     Between two steps it stands at an instant `t` at which robots have said their states and leaders have said what
     accelerations they want, and no robot has acted on them yet.  What `commands` holds then is what the robots do.
 
-    Raises UserError for a scenario or changes that are wrong (`echelon.planning.loading`).
+    Raises UserError for a scenario or changes that are wrong (`echelon.planning.loading`), and in each call if a part of
+    yours fails.
     """
 
     def __init__(self, scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> None:

@@ -30,11 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(end="", flush=True)  # while what goes wrong with it can still be told
         return code
     except UserError as error:
+        if debug and error.__cause__ is not None:  # what a user's part raised
+            import traceback
+
+            traceback.print_exception(error.__cause__)
         print(f"echelon: {error}", file=sys.stderr)
-        return 2
-    except PartRunError as error:
-        print(f"echelon: {one_line(str(error))}", file=sys.stderr)
-        return 3
+        return 3 if isinstance(error, PartRunError) else 2
     except BrokenPipeError:  # a reader such as head that has seen enough
         _drop_output()
         return 0

@@ -112,7 +112,7 @@ def make_parser(names: Collection[str] = ENTRIES.keys()) -> ArgumentParser:
         prog="echelon", description=ABOUT, epilog=_epilog("a first look", FIRST_LOOK, CODES), formatter_class=_Help
     )
     top.add_argument("--version", action="version", version=f"echelon {__version__}")
-    debug = "show the traceback of an error that nobody expected"
+    debug = "show the traceback of an error that nobody expected, or in a part of yours"
     top.add_argument("--debug", action="store_true", help=debug)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     for name, entry in ENTRIES.items():

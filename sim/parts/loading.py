@@ -83,5 +83,5 @@ def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:
         probe(plan)
         try_protocols(plan)
     except PartRunError as error:
-        raise ScenarioError(f"{name}: {error}") from None
+        raise ScenarioError(f"{name}: {error}") from error.__cause__  # what the part raised, for --debug
     return scenario, plan

@@ -42,7 +42,7 @@ class Child:
     process: ForkServerProcess
     control: Connection
     words: Connection
-    """The pipe with its standard output and standard error"""
+    """The pipe with its standard error"""
     heard_s: float
     ready: bool = False
     done: Done | None = None

@@ -1,6 +1,6 @@
 """The entry point of each process of a distributed run (`contract` has the steps of its life).
 
-Standard output and standard error go to the supervisor.
+Standard error goes to the supervisor.  Standard output, to which users' parts print, is the command's standard error.
 """
 
 import ctypes
@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import traceback
+from io import TextIOWrapper
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -32,9 +33,14 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # the name in ps, top and pgrep (15 characters)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but only the supervisor reacts
     signal.signal(signal.SIGTERM, _leave)
-    os.dup2(words.fileno(), 1)
+    try:
+        os.dup2(2, 1)
+    except OSError:  # the command's standard error is closed
+        os.dup2(words.fileno(), 1)
     os.dup2(words.fileno(), 2)
     words.close()
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # a process may end without writing what is left
     body: Body
     try:
         if not spec.virtual and spec.kind == "recorder":

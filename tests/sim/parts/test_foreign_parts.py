@@ -283,6 +283,36 @@ def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way
         wheels_are_at_zero(folder / "run")
 
 
+@pytest.mark.parametrize("way", ["in process", "processes"])
+def test_what_a_part_prints_goes_to_standard_error(folder: Path, way: str) -> None:
+    use = write(folder, "law", "print(f'state of {block.name}:', state[0])")
+    done = run(folder, use, *WAYS[way], "--json")
+    assert done.returncode in (0, 1), done.stderr
+    assert json.loads(done.stdout)["parts"][0]["use"] == "mine.py:Mine"
+    said = done.stderr.splitlines()
+    assert "state of g2: 31.0" in said
+    assert "state of centroid: 31.0" in said
+
+
+def test_a_part_that_fails_in_a_simulation_is_an_error_of_the_user(folder: Path) -> None:
+    import echelon as package
+
+    (folder / "mine.py").write_text(LAW.replace("LINE", f"{LATER['law']} raise KeyError('w')"))
+    changes = {"law": {"use": "mine.py:Mine", "epsilon": [0.5, 0.5], "lead": 0.5, "gains": [{"k1": 0.25, "k2": 0.5}]}}
+    simulation = package.Simulation(folder / "mine.toml", changes)
+    with pytest.raises(
+        package.UserError, match=r"mine\.py, line 9: Mine of block g2: nu at t = 0\.3 s raised KeyError"
+    ):
+        simulation.run_until(1.0)
+
+
+def test_debug_shows_the_traceback_of_a_part(folder: Path) -> None:
+    done = echelon("validate", folder / "mine.toml", "--set", write(folder, "law", "1 / 0"), "--debug")
+    assert done.returncode == 2
+    assert 'File "mine.py", line 9, in nu' in done.stderr
+    assert done.stderr.splitlines()[-1].endswith("nu at t = 0 s raised ZeroDivisionError: division by zero")
+
+
 @pytest.mark.parametrize("line", ["return e[:1]", "return e * float('nan')"])
 def test_nonsense_in_a_run_is_named_too(folder: Path, line: str) -> None:
     said = [

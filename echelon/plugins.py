@@ -11,7 +11,9 @@ A file is read once, when the scenario is loaded.  Its text travels with the pla
 run the same code even if the file changes meanwhile, and no folder is added to Python's module path.
 """
 
+import ast
 import hashlib
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +25,7 @@ from traceback import walk_tb
 from types import ModuleType
 from typing import Any, Final, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, PydanticUserError, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.errors import PartRunError
@@ -32,6 +34,10 @@ T_co = TypeVar("T_co", covariant=True)
 
 GROUPS: Final = ("laws", "plants", "trajectories", "protocols")
 """The kinds of parts; `echelon.<group>` is the group of their entry points."""
+
+
+_NO_TYPE: Final = re.compile(r"non-annotated attribute was detected: `(\w+) = (.*?)`")
+"""What pydantic says of a field without a type"""
 
 
 class PartError(ValueError):
@@ -105,7 +111,11 @@ class Part(Generic[T_co]):
         who, calls = self.use, self.calls_in(error)
         if self.source is not None and calls:
             who = f"{self.source.name}, line {calls[-1][1]}: {type(self.made).__name__}"
-        return PartRunError(f"{who}{whom}: {what} raised {_error_text(error)}")
+        if isinstance(error, ValidationError) and (found := error.errors()[0])["type"].startswith("frozen"):
+            text = f"sets self.{found['loc'][0]}: a part's attributes do not change; a law keeps numbers in `state`"
+        else:
+            text = f"raised {_error_text(error)}"
+        return PartRunError(f"{who}{whom}: {what} {text}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the source in place of the object: the process that unpickles a plan runs the file's text itself."""
@@ -162,7 +172,7 @@ class PartGroup:
 
     def _checked(self, found: Any, use: str) -> type[Plugin]:
         if not (isinstance(found, type) and issubclass(found, self.base)):
-            raise PartError(f"{use} must be a class derived from {self.base.__module__}.{self.base.__name__}")
+            raise PartError(f"{use} must be a class derived from echelon.{self.base.__name__}")
         if missing := sorted(getattr(found, "__abstractmethods__", ())):
             raise PartError(f"{use} lacks the method {', '.join(missing)}")
         return found
@@ -259,4 +269,15 @@ def _print(*values: object, file: Any = None, **options: Any) -> None:
 
 
 def _error_text(error: BaseException) -> str:
+    if isinstance(error, PydanticUserError) and (found := _NO_TYPE.search(str(error))):
+        name, value = found.groups()
+        return f"{name} needs a type: {name}: {_type_of(value)} = {value}"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def _type_of(value: str) -> str:
+    """Returns the name of the type of a value that is written in Python; "…" if it is not a number, text, list or the like."""
+    try:
+        return type(ast.literal_eval(value)).__name__
+    except (ValueError, SyntaxError):
+        return "…"

@@ -114,7 +114,7 @@ def test_files_of_one_name_in_two_folders_are_different_modules(
         ('trajectory={use="none.py:Spiral"}', "trajectory.use = 'none.py:Spiral': "),
         ('trajectory={use="none.py:Spiral"}', "No such file or directory"),
         ('trajectory={use="my_paths.py:Spirale"}', "my_paths.py has no class Spirale; it has Spiral"),
-        ('trajectory={use="my_plants.py:Sticky"}', "must be a class derived from echelon.controller.trajectory.Trajectory"),
+        ('trajectory={use="my_plants.py:Sticky"}', "must be a class derived from echelon.Trajectory"),
         ('trajectory={use="my_paths.py:cos"}', "must be a class derived from"),
         ('trajectory={use="spiral"}', "must be one of 'line', 'circle', 'sine', 'waypoints', or 'file.py:Class'"),
         ("trajectory={use=3}", "trajectory.use = 3: must be one of"),
@@ -148,6 +148,12 @@ def test_mistakes_name_key_value_and_what_is_allowed(folder: Path, override: str
             SPIRAL.replace("rate: float", "rates: float"),
             "trajectory.parameters.rate: unknown key; did you mean 'rates'?",
         ),
+        (SPIRAL.replace("rate: float = 0.2", "rate = 0.2"), "my_paths.py: rate needs a type: rate: float = 0.2"),
+        (SPIRAL.replace("rate: float = 0.2", "rate = np.pi * 1j"), "my_paths.py: rate needs a type: rate: complex = "),
+        (
+            SPIRAL.replace("rate: float = 0.2", "rate = np.zeros(1)"),
+            "my_paths.py: rate needs a type: rate: … = array([0.])",
+        ),
         ("\0", "source code string cannot contain null bytes"),
     ],
 )
@@ -176,6 +182,8 @@ def test_a_trajectory_that_fails_in_a_run_is_named(folder: Path, line: str, says
 @pytest.mark.parametrize(
     ("line", "says"),
     [
+        ("self.share = 3", "step sets self.share: a part's attributes do not change; a law keeps numbers in `state`"),
+        ("self.other = 3", "step sets self.other: a part's attributes do not change; a law keeps numbers in `state`"),
         ("raise KeyError('w')", "step raised KeyError: 'w'"),
         ("return None", "step must return a RobotState (state_at), not None"),
         ("return state._replace(v=float('inf'))", "step is not finite: RobotState("),
@@ -186,5 +194,5 @@ def test_a_plant_that_fails_in_a_run_is_named(folder: Path, line: str, says: str
     step = make_step(untried(folder, USE_PLANT).robots[0])
     with pytest.raises(PartRunError) as caught:
         step(state_at(0, 0, 0, 0, 0), 0.0, 0.0, 0.1)
-    where = "my_plants.py, line 9: Sticky" if "raised" in says else "my_plants.py:Sticky"
+    where = "my_plants.py, line 9: Sticky" if "raised" in says or "sets" in says else "my_plants.py:Sticky"
     assert str(caught.value).startswith(f"{where} of g1/r1: {says}")

@@ -94,7 +94,7 @@ class Caller:
     def check(self, what: str, frame: Any) -> None:
         """Raises PartRunError for an invalid frame or identifier."""
         if not (isinstance(frame, Frame) and type(frame.can_id) is int and type(frame.remote) is bool):
-            raise self.wrong(f"{what} must return frames (bridge.protocols.frame.Frame), not {frame!r:.60}")
+            raise self.wrong(f"{what} must return frames (echelon.bridge.protocols.frame.Frame), not {frame!r:.60}")
         if not (isinstance(frame.data, bytes) and len(frame.data) <= 8):
             raise self.wrong(f"{what}: a frame has up to 8 bytes, not {frame.data!r:.60}")
         if frame.can_id not in self.allowed:
@@ -184,7 +184,7 @@ class CheckedDrive:
         count = len(protocol.wheels[number])
         if len(self.motors) != count or not all(isinstance(motor, Motor) for motor in self.motors):
             raise self._caller.wrong(
-                f"drive: motors must be {count} bridge.protocols.motor.Motor, not {self.motors!r:.60}"
+                f"drive: motors must be {count} echelon.bridge.protocols.motor.Motor, not {self.motors!r:.60}"
             )
 
     @property

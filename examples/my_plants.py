@@ -2,7 +2,8 @@
 
 from math import tanh
 
-from echelon.agents.plant import Plant, paper_step
+from echelon import Plant
+from echelon.agents.plant import paper_step
 
 
 class Slipping(Plant):

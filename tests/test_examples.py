@@ -101,6 +101,18 @@ def test_the_page_shows_what_the_examples_are() -> None:
         assert code.strip() in (ROOT / title.removeprefix("# ")).read_text(encoding="utf-8"), title
 
 
+def test_the_linear_law_of_the_page_can_be_analysed(folder: Path) -> None:
+    page = (ROOT / "docs" / "add-a-law.md").read_text(encoding="utf-8")
+    (code,) = [block for block in page.split("```python\n") if block.startswith("# pd_laws.py")]
+    (folder / "pd_laws.py").write_text(code.partition("```")[0], encoding="utf-8")
+    law = ("--set", 'law={use="pd_laws.py:PD",epsilon=[0.5,0.5]}')
+    done = echelon(folder, "analyse", "mine.toml", *law)
+    assert done.returncode == 0, done.stderr
+    built_in = 'law={use="linear",epsilon=[0.5,0.5],gains=[{k1=0.25,k2=1.0}]}'
+    assert done.stdout == echelon(folder, "analyse", "mine.toml", "--set", built_in).stdout
+    assert "all together, with these delays: settles" in done.stdout
+
+
 def wheel(folder: Path, modules: Sequence[str], entry_points: str) -> Path:
     """Makes a distribution of some modules of the examples."""
     path, info = folder / "my_parts-1.0-py3-none-any.whl", "my_parts-1.0.dist-info"

@@ -165,6 +165,7 @@ class _LinearBlocks:
         self._K_1, self._K_2, self._K_i = (
             block_diag(*(getattr(each, name) for each in gains)) for name in ("K_1", "K_2", "K_i")
         )
+        self._uses_q = np.any(self._K_i, axis=0, keepdims=True).T  # the rest of q would never settle, and acts on nothing
         self.size = len(self._K_1)
         phi = node_matrix(node.weights)
         self._back = np.kron(np.linalg.inv(phi), np.eye(2))[:, : self.size]
@@ -177,4 +178,4 @@ class _LinearBlocks:
         """Returns Φ_node⁻¹ η and the next q."""
         e, e_dot = self._e @ s, self._e_dot @ s
         eta = -(self._K_1 @ e) - self._K_2 @ e_dot - self._K_i @ q
-        return self._back @ eta, q + self._T * e + self._T**2 / 2 * e_dot
+        return self._back @ eta, self._uses_q * (q + self._T * e + self._T**2 / 2 * e_dot)

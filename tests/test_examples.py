@@ -176,7 +176,7 @@ def test_installed_parts_are_used_by_name(tmp_path: Path) -> None:
     for use, says in (
         ("sliding", "did you mean 'sliding_mode'?"),
         ("broken", "the installed my_parts_my_laws:Nothing cannot be loaded: AttributeError"),
-        ("plant_for_a_law", "plant_for_a_law must be a class derived from echelon.controller.laws.law.Law"),
+        ("plant_for_a_law", "plant_for_a_law must be a class derived from echelon.Law"),
     ):
         done = echelon(folder, "validate", "mine.toml", "--set", f"law.use={use}", env=env)
         assert done.returncode == 2

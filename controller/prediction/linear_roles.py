@@ -165,7 +165,8 @@ class _LinearBlocks:
         self._K_1, self._K_2, self._K_i = (
             block_diag(*(getattr(each, name) for each in gains)) for name in ("K_1", "K_2", "K_i")
         )
-        self._uses_q = np.any(self._K_i, axis=0, keepdims=True).T  # the rest of q would never settle, and acts on nothing
+        # A part of q that acts on nothing would never settle.
+        self._uses_q = np.any(self._K_i, axis=0, keepdims=True).T
         self.size = len(self._K_1)
         phi = node_matrix(node.weights)
         self._back = np.kron(np.linalg.inv(phi), np.eye(2))[:, : self.size]

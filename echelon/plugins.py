@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import entry_points
+from io import StringIO
 from multiprocessing import parent_process
 from pathlib import Path
 from traceback import walk_tb
@@ -265,7 +266,11 @@ def _print(*values: object, file: Any = None, **options: Any) -> None:
     for the command's result (`--json`).  In the processes of a run, standard output is the command's standard error."""
     if file is None:
         file = sys.stderr if parent_process() is None else sys.stdout
-    print(*values, file=file, **options)
+    flush, whole = options.pop("flush", False), StringIO()
+    print(*values, file=whole, **options)
+    file.write(whole.getvalue())  # at once, for several processes may print at the same time
+    if flush:
+        file.flush()
 
 
 def _error_text(error: BaseException) -> str:

@@ -336,7 +336,11 @@ def _referee(evidence: Evidence) -> Iterator[CheckResult]:
         yield CheckResult("referee", "not tested", "no frame was on the bus", unit="findings")
         return
     total = sum(can.referee.kinds.values())
-    text = finding_text(can.referee) if total else f"nothing breaks the contract in {can.referee.frames} frames"
+    text = (
+        finding_text(can.referee)
+        if total
+        else f"nothing breaks the contract in {can.referee.frames} frames{can.referee.up_to}"
+    )
     yield CheckResult("referee", "failed" if total else "passed", text, float(total), "findings", 0.0)
 
 

@@ -163,9 +163,10 @@ class SeparationResult:
     slower: str
     sigma_ratio: float
     rate_ratio: float | None
-    """Decay rate of the faster over that of the slower, of each the slowest of its blocks; None if one does not decay"""
+    """Decay rate of the faster over that of the slower, of each the slowest of its blocks; None if one does not decay, or the
+    run is too short to tell"""
     rate_fit: float | None
-    """The smaller r² of the two fits"""
+    """The smallest r² of the fits; None where there is no ratio for lack of time"""
     settling_2_ratio: float | None
     """Settling time of the slower over that of the faster; other than a ratio of time scales, it depends on where they start"""
     settling_5_ratio: float | None

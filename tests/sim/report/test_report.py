@@ -124,9 +124,9 @@ def test_ids_are_unique_or_repeat_the_same_thing(both):
 
 
 def test_every_figure_has_words_for_those_who_do_not_see_it(single, both):
-    for page, count in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):
+    for page, figures in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):
         labels = [value for tag, key, value in page.attributes if (tag, key) == ("svg", "aria-label")]
-        assert page.tags.count("svg") == len(labels) == count
+        assert page.tags.count("svg") == len(labels) == figures
         assert all(len(label) > 20 for label in labels)
 
 

@@ -98,6 +98,11 @@ class Run:
         return self.summary.verdict.word == "HOLDS"
 
     @property
+    def ok(self) -> bool:
+        """True unless a claim or a check failed: the verdict is HOLDS, or HEALTHY because the run claimed nothing."""
+        return self.summary.verdict.word != "FAILS"
+
+    @property
     def failure(self) -> str | None:
         """Why the run broke off, None if it did not."""
         return self.summary.run.failure

@@ -20,7 +20,7 @@ from echelon.sim.view.live import Display
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Launch:
-    """How a scenario is to be run; see `echelon run --help`."""
+    """How a scenario is to be run; see `echelon run --help`.  Raises UsageError for an unknown engine or clock."""
 
     engine: Literal["processes", "inprocess"] = "processes"
     clock: Literal["virtual", "wall"] = "virtual"
@@ -32,6 +32,14 @@ class Launch:
     keep_going: bool = False
     replace: bool = False
     """Delete the run of another scenario that `out` holds"""
+
+    def __post_init__(self) -> None:
+        for name, value, allowed in (
+            ("engine", self.engine, ("processes", "inprocess")),
+            ("clock", self.clock, ("virtual", "wall")),
+        ):
+            if value not in allowed:
+                raise UsageError(f"{name} = {value!r}: must be {' or '.join(map(repr, allowed))}")
 
 
 def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:

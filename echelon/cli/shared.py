@@ -9,7 +9,7 @@ SCENARIO: Final = (
     "a TOML file, the name of a shipped scenario (paper, lab, …), the folder of a run, or - for standard input"
 )
 OVERRIDES: Final = option(
-    "change a value of the scenario: law.epsilon=[0.1,0.2], links[0].delay=0.05; may be repeated",
+    "change a value of the scenario: law.epsilon=[0.1,0.2], links.0.delay=0.05; may be repeated",
     "KEY=VALUE",
     flag="--set",
 )

@@ -73,7 +73,7 @@ def test_what_is_not_there_is_named(lab: echelon.Run) -> None:
 
 
 def test_the_summary_is_in_the_attributes(lab: echelon.Run) -> None:
-    assert (lab.verdict.word, lab.holds) == ("HEALTHY", False)  # it claims nothing
+    assert (lab.verdict.word, lab.holds, lab.ok) == ("HEALTHY", False, True)  # it claims nothing
     assert lab.failure is None
     assert (lab.scenario, lab.duration, lab.claims) == ("lab", 0.5, ())
     assert lab.distance.smallest > 0
@@ -228,3 +228,11 @@ def test_importing_it_is_cheap() -> None:
     code = "import sys, echelon; print(json.dumps(sorted(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", f"import json\n{code}"], capture_output=True, text=True, check=True)
     assert not {"numpy", "zenoh", "can", "pydantic", "matplotlib"} & set(json.loads(done.stdout))
+
+
+@pytest.mark.parametrize("wrong", [{"engine": "in_process"}, {"clock": "real"}])
+def test_an_engine_or_a_clock_that_does_not_exist_is_refused(wrong: dict[str, str], tmp_path: Path) -> None:
+    ((name, value),) = wrong.items()
+    with pytest.raises(echelon.UserError, match=f"{name} = '{value}': must be "):
+        echelon.run("lab", out=tmp_path / "run", quiet=True, **wrong)  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()

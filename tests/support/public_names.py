@@ -2,8 +2,11 @@
 
 import ast
 import inspect
+import textwrap
 from argparse import ArgumentParser, _SubParsersAction
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from functools import cached_property
 
 import echelon
 from echelon.cli.parser import ENTRIES, MISTAKES, make_parser
@@ -11,6 +14,7 @@ from echelon.messages import Channel
 from echelon.plugins import Plugin
 from echelon.sim.out_folder import run_files
 from echelon.sim.parts.loading import REGISTRY
+from echelon.sim.results.records import Summary
 from support.runs import ROOT, plan_of
 
 HEAD = """\
@@ -52,16 +56,26 @@ def _members(of: type) -> Iterator[str]:
     if issubclass(of, tuple):
         yield from (f"  - `.{field}`" for field in of._fields)  # type: ignore[attr-defined]
         return
-    for name, member in sorted(vars(of).items()):
+    attributes = {} if issubclass(of, Plugin) else dict.fromkeys(_attributes(of))
+    if of is echelon.Run:
+        attributes |= dict.fromkeys(field.name for field in fields(Summary))
+    for name, member in sorted((attributes | dict(vars(of))).items(), key=lambda item: item[0]):
         if name.startswith("_") or name.startswith("model_"):
             continue
         abstract = " (must be given)" if getattr(member, "__isabstractmethod__", False) else ""
         if inspect.isfunction(member):
             yield f"  - `.{name}{_signature(member)}`{abstract}"
-        elif isinstance(member, property):
+        elif isinstance(member, (property, cached_property)):
             yield f"  - `.{name}`{abstract}"
-        elif name in getattr(of, "__annotations__", {}):
+        elif name in getattr(of, "__annotations__", {}) or name in attributes or isinstance(member, Mapping):
             yield f"  - `.{name}`"
+
+
+def _attributes(of: type) -> Iterator[str]:
+    """Yields the public attributes that methods of a class set."""
+    for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(of)))):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self":
+            yield node.attr
 
 
 def _signature(value: object) -> str:

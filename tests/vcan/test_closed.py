@@ -15,6 +15,7 @@ import cantools
 import pytest
 
 from echelon.bridge.protocols.native.codec import FEEDBACK_ID, FaultCode, Feedback, NativeCodec, Torque
+from echelon.sim.out_folder import OutFolder
 from echelon.sim.parts.loading import load
 from echelon.sim.run import execute
 from echelon.sim.view.live import Display
@@ -58,7 +59,8 @@ def in_one_process(scenario: Path, overrides: Sequence[str], folder: Path) -> st
     folder.mkdir()
     loaded, plan = load(scenario, overrides)
     display = Display(plan, quiet=True)
-    summary, _ = execute(loaded, plan, folder, engine="inprocess", clock="virtual", can_urls=(), display=display)
+    out = OutFolder(folder, loaded.name, ())
+    summary, _ = execute(loaded, plan, out, engine="inprocess", clock="virtual", can_urls=(), display=display)
     assert summary.run.failure is None
     return str(summary.trace_digest)
 

@@ -325,7 +325,7 @@ def test_messages_that_cannot_be_are_counted_and_nothing_else() -> None:
 def test_an_overloaded_bus_loses_frames_and_says_so() -> None:
     engine = ran(closed("can.bitrate=125000", "can.queue=8"))
     bridge, drives = stations(engine)
-    bus = bridge.timing.buses[0]
+    bus = bridge.buses[0]
     assert bus.load > 0.98
     assert sum(row.lost for row in bus.traffic.values()) + sum(placed.lost.total() for placed in drives.drives) > 100
     for row in bus.traffic.values():
@@ -342,7 +342,7 @@ def test_disturbed_frames_are_sent_again_and_a_controller_that_is_off_comes_back
         heard,
     )
     bridge, _ = stations(engine)
-    bus = bridge.timing.buses[0]
+    bus = bridge.buses[0]
     assert sum(row.retransmitted for row in bus.traffic.values()) > 50
     kinds = [event.kind.value for event in bus.events if event.node == BRIDGE_NODE and event.time_ns >= 1000 * MS]
     assert kinds[:2] == ["bus-off", "recovered"]
@@ -379,7 +379,7 @@ def test_a_drive_that_is_off_the_bus_comes_back_with_news_only() -> None:
     heard = Heard()
     engine = ran(closed('events=[{kind="bus_off", at=0.5, robot="g1/r1"}]', "robot.drive.recover_after=0.1"), heard)
     bridge, drives = stations(engine)
-    assert bridge.timing.buses[0].traffic[0x180].latency_max_ns < 2 * PERIOD
+    assert bridge.buses[0].traffic[0x180].latency_max_ns < 2 * PERIOD
     assert 0 <= drives.drives[0].waiting <= 2
     assert bridge.robots[0].host.enabled
 

@@ -198,6 +198,13 @@ class RefereeReport:
     """By bus and identifier, for example `can0:101`"""
     source: str = "can.log"
     """Where the frames came from: `can.log`, or `bus` if the referee listened itself"""
+    until: float | None = None
+    """Only frames up to then were judged, for the run was stopped there [s]; None: all frames"""
+
+    @property
+    def up_to(self) -> str:
+        """Up to when frames were judged, in words that follow their number; empty if all were."""
+        return "" if self.until is None else f" up to {self.until:g} s, where the run was stopped"
 
 
 @dataclass(frozen=True, slots=True)

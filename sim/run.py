@@ -99,11 +99,12 @@ def execute(
             keep_going=keep_going,
         ).run()
     can = outcome.can
-    if can is not None and can.referee is None:
+    if can is not None and (can.referee is None or outcome.stopped):
+        common_ns, _ = outcome.trace.common()
+        until_ns = int(common_ns[-1]) if outcome.stopped and len(common_ns) else None
+        whole = not (outcome.failure or outcome.stopped)
         try:
-            can = replace(
-                can, referee=judged(folder / LOG, plan, clock, whole=not (outcome.failure or outcome.stopped))
-            )
+            can = replace(can, referee=judged(folder / LOG, plan, clock, whole, until_ns))
         except PartRunError as error:
             outcome.failure = outcome.failure or str(error)
     display.close()
@@ -114,11 +115,12 @@ def execute(
     return summary, outcome.trace
 
 
-def judged(log: Path, plan: Plan, clock: str, whole: bool) -> RefereeReport:
-    """Returns what the referee finds in a run's can.log."""
+def judged(log: Path, plan: Plan, clock: str, whole: bool, until_ns: int | None = None) -> RefereeReport:
+    """Returns what the referee finds in a run's can.log, up to `until_ns` if the run was stopped then."""
     from echelon.bridge.referee.referee import judge_log
 
-    return judge_log(log, plan, tolerance_ns=plan.can.watchdog_ns // 2 if clock == "wall" else None, whole=whole)
+    tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
+    return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole, until_ns=until_ns)
 
 
 def _in_process(

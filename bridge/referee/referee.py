@@ -24,6 +24,7 @@ commands, one per acceleration period.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -214,18 +215,22 @@ class Referee:
         return finding
 
 
-def judge_log(path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True) -> RefereeReport:
+def judge_log(
+    path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True, until_ns: int | None = None
+) -> RefereeReport:
     """Returns the referee's report on the can.log of a run.
 
-    `whole` says that the run was not cut off: then cyclic frames that are missing at the end of the log are silence.
+    `whole` says that the run was not cut off: then cyclic frames that are missing at the end of the log are silence.  Of a run
+    that was stopped, only frames up to `until_ns` are judged: some processes go on for a while, others do not.
     Raises OSError if the log cannot be read."""
     referee = Referee(plan, tolerance_ns=tolerance_ns)
     last_ns = 0
     for time_ns, bus, frame in read_run_log(path, plan):
-        last_ns = time_ns
-        referee.observe(time_ns, bus, frame)
+        if until_ns is None or time_ns <= until_ns:
+            last_ns = time_ns
+            referee.observe(time_ns, bus, frame)
     referee.finish(max(last_ns, plan.duration_ns) if whole else last_ns)
-    return referee.report()
+    return replace(referee.report(), until=None if until_ns is None else until_ns / 1e9)
 
 
 def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:

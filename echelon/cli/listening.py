@@ -59,9 +59,11 @@ def show_live(
 
 def show_end(plan: Plan, folder: Path, as_json: bool) -> None:
     """Shows how a run ended by its can.log.  Raises UserError."""
-    table = CanTable(plan, Referee(plan, tolerance_ns=_told_by(folder, plan)[0]), _names(plan))
+    tolerance_ns, _, until_ns = _told_by(folder, plan)
+    table = CanTable(plan, Referee(plan, tolerance_ns=tolerance_ns), _names(plan))
     for logged in _read(folder, plan):
-        table.take(*logged)
+        if until_ns is None or logged[0] <= until_ns:
+            table.take(*logged)
     _finish(table, folder)
     if as_json:
         print(json.dumps(table.data(table.time_ns), allow_nan=False))
@@ -108,24 +110,27 @@ def _show(table: CanTable, heard: Iterator[Heard], as_json: bool, console: Conso
 def judge_run(plan: Plan, folder: Path) -> RefereeReport:
     """Judges a run's can.log as the run itself did: on a wall clock processes may be late.  Of a run that goes on, what there
     is by now.  Raises UserError."""
-    tolerance_ns, whole = _told_by(folder, plan)
+    tolerance_ns, whole, until_ns = _told_by(folder, plan)
     try:
-        return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=whole)
+        return judge_log(folder / LOG, plan, tolerance_ns=tolerance_ns, whole=whole, until_ns=until_ns)
     except OSError as error:
         raise UsageError(f"{folder / LOG}: {error.strerror}") from None
 
 
-def _told_by(folder: Path, plan: Plan) -> tuple[int | None, bool]:
-    """Returns how late a frame of a run may be [ns] (None: as the referee has it), and whether its log must go to its end: not
-    if it goes on or broke off, for what our own stop sends, or does not send any more, is no finding."""
+def _told_by(folder: Path, plan: Plan) -> tuple[int | None, bool, int | None]:
+    """Returns how late a frame of a run may be [ns] (None: as the referee has it), whether its log must go to its end: not if
+    it goes on or broke off, for what our own stop sends, or does not send any more, is no finding; and up to when frames are
+    judged [ns], if the run was stopped."""
     state = read_state(folder)
     try:
-        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        run, until_s = summary["run"], summary["simulated"]
     except (OSError, ValueError, KeyError, TypeError):
-        run = {}
+        run, until_s = {}, None
     clock = run.get("clock") or (state.clock if state else "")
     whole = not (run.get("failure") or run.get("stopped") or goes_on(folder))
-    return plan.can.watchdog_ns // 2 if clock == "wall" else None, whole
+    until_ns = round(until_s * 1e9) if until_s is not None and run.get("stopped") else None
+    return plan.can.watchdog_ns // 2 if clock == "wall" else None, whole, until_ns
 
 
 def _finish(table: CanTable, folder: Path) -> None:
@@ -174,7 +179,7 @@ def verdict(report: RefereeReport) -> str:
     """Returns what was seen and found, in a line."""
     kinds = ", ".join(f"{kind} {count}" for kind, count in report.kinds.items())
     foreign = f", {report.unknown} frames of others" if report.unknown else ""
-    seen = f"{report.frames} frames of {len(report.identifiers)} identifiers{foreign}"
+    seen = f"{report.frames} frames of {len(report.identifiers)} identifiers{foreign}{report.up_to}"
     return f"{seen}: {sum(report.kinds.values())} findings: {kinds}" if kinds else f"{seen}: no findings"
 
 

@@ -93,6 +93,18 @@ class RunError(Exception):
     """The run cannot go on; the text says why."""
 
 
+class StallError(RunError):
+    """A run in virtual time made no progress for a while, for `who`."""
+
+    def __init__(self, still_s: float, who: str) -> None:
+        self._still_s, self._who = still_s, who
+        super().__init__(self.text("an unknown instant"))
+
+    def text(self, when: str) -> str:
+        """Returns what happened, in words; `when` it did is known for certain only once all is recorded."""
+        return f"stalled for {self._still_s:.0f} s at {when}: {self._who}"
+
+
 class DivergedError(Exception):
     """There is no point in going on; the text says why."""
 
@@ -135,6 +147,7 @@ class Supervisor:
         """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised."""
         begun_s = time.monotonic()
         failure: str | None = None
+        stall: StallError | None = None
         diverged = False
         startup_s = wall_s = 0.0
         previous = signal.signal(signal.SIGTERM, _interrupt)
@@ -152,6 +165,8 @@ class Supervisor:
             self._until(lambda: all(child.done for child in members), limit_s, "not done")
             wall_s = time.monotonic() - start_s
             self.progress.phase = "finishing"
+        except StallError as error:
+            stall, failure = error, error.text(f"t = {self.progress.time_ns / 1e9:g} s")
         except RunError as error:
             failure = str(error)
         except DivergedError as error:
@@ -171,7 +186,11 @@ class Supervisor:
         finally:
             self._take_down()
             signal.signal(signal.SIGTERM, previous)
-        return self._outcome(failure, startup_s, wall_s)
+        outcome = self._outcome(failure, startup_s, wall_s)
+        common_ns, _ = outcome.trace.common()
+        if stall is not None and len(common_ns):
+            outcome.failure = stall.text(f"t = {common_ns[-1] / 1e9:g} s")
+        return outcome
 
     def _lead_in_s(self) -> float:
         """Returns the time from `Start` to run time 0 on a wall clock, in which drives are brought up [s]."""
@@ -287,9 +306,7 @@ class Supervisor:
             self._warned = True
             self.progress.note = f"stalled at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
         if still_s > self._stall_timeout_s:
-            raise RunError(
-                f"stalled for {still_s:.0f} s at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
-            )
+            raise StallError(still_s, self._who_is_waited_for(now_s))
 
     def _who_is_waited_for(self, now_s: float) -> str:
         """Returns in words which processes everyone waits for: those that report nothing, not even that they wait."""

@@ -54,7 +54,7 @@ def _sentences(can: CanReport) -> list[str]:
 
 def _referee(referee: RefereeReport) -> str:
     found = ", ".join(f"{count} {kind}" for kind, count in referee.kinds.items()) or "nothing wrong"
-    words = subheading("Referee") + paragraph(f"It looked at {referee.frames} frames and found {found}.")
+    words = subheading("Referee") + paragraph(f"It looked at {referee.frames} frames{referee.up_to} and found {found}.")
     rows = [[f"{row.time:.6g}", row.bus, row.id, row.robot, row.kind, row.text] for row in referee.findings[:MAX_ROWS]]
     if not rows:
         return words

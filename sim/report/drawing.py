@@ -233,6 +233,10 @@ class TimeAxis:
         step = 10.0 ** np.floor(np.log10(1.25 * t)) / 2
         return replace(self, last=float(np.ceil(1.25 * t / step) * step))
 
+    def shows(self, t: float) -> bool:
+        """Returns whether an instant [s] is between the ends of the axis."""
+        return (self.first if self.log else 0.0) <= t <= self.last
+
     def thin(self, times_ns: NDArray[np.int64], values: Array) -> tuple[Array, Array]:
         """Returns the part of a line that the axis shows, thinned."""
         if self.last < self.end:

@@ -144,7 +144,7 @@ def smallest_distance(near: Distances, plan: Plan, width: float) -> Picture:
         axes = figure.subplots()
         radii(axes, radius, sensing)
         axes.plot(*time.thin(near.times_ns, shown), color=INK, lw=1.0, zorder=3)
-        if near.closest is not None and (near.closest.time_ns > 0 or not time.log):
+        if near.closest is not None and time.shows(near.closest.time_ns / 1e9):
             at = near.closest.time_ns / 1e9, max(near.closest.distance, radius * 1e-3)
             axes.plot(*at, "o", ms=5, mfc="white", mec=INK, zorder=5, clip_on=False)
         distance_limits(axes, shown, radius, sensing)
@@ -194,11 +194,14 @@ def small_multiples(figure: Figure, count: int, columns: int, sharey: bool = Tru
 
 
 def distance_time(near: Distances, plan: Plan) -> TimeAxis:
-    """Returns the time axis for distances: while the smallest is more than 2 % off what it is in the end."""
+    """Returns the time axis for distances: while the smallest is more than 2 % off what it is in the end, and up to the
+    closest encounter."""
     smallest, time = drawable(near.smallest), TimeAxis.of(plan, near.times_ns)
     if not len(smallest) or not np.isfinite(smallest).all():
         return time
-    return time.until(_last_s(near.times_ns, np.abs(smallest - smallest[-1]) > CALM * abs(smallest[-1])))
+    closest_s = 0.0 if near.closest is None else near.closest.time_ns / 1e9
+    moves_s = _last_s(near.times_ns, np.abs(smallest - smallest[-1]) > CALM * abs(smallest[-1]))
+    return time.until(max(moves_s, closest_s))
 
 
 def torque_time(trace: Trace) -> TimeAxis:

@@ -42,7 +42,7 @@ from echelon.sim.report.page import (
 from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.block_series import Blocks, block_series
 from echelon.sim.results.distances import Distances, distances
-from echelon.sim.results.records import Summary
+from echelon.sim.results.records import DistanceResult, Summary, count
 from echelon.sim.results.summary import number
 from echelon.sim.results.trace import Trace
 
@@ -311,7 +311,7 @@ def _distances(one: _Shown) -> str:
         f"Smallest distance between robots over time; the smallest is {number(distance.smallest, 'm')}.",
         "Smallest distance of all pairs; between recorded instants robots are taken to move straight. Circle: the closest "
         f"encounter. Tinted: closer than the avoidance radius rₐ. Rₛ: sensing radius. {time.words_then(CALM_DISTANCE)}"
-        + ("" if distance.avoidance_enabled else " Avoidance is not enabled: robots keep out of it by chance."),
+        + ("" if distance.avoidance_enabled else f" Avoidance is not enabled: {_without_avoidance(distance)}."),
     )
     if not violations:
         return drawn + paragraph("No pair came within the avoidance radius.")
@@ -319,6 +319,14 @@ def _distances(one: _Shown) -> str:
     rows = [[" – ".join(row.pair), f"{row.first:.6f}", f"{row.last:.6f}", row.smallest] for row in shown]
     head = ["violation", "from [s]", "to [s]", "smallest [m]"]
     return drawn + table(head, rows, what="violations") + rest(len(violations), MAX_ROWS)
+
+
+def _without_avoidance(distance: DistanceResult) -> str:
+    """Says how close robots came, of which nothing kept them apart."""
+    pairs = len({violation.pair for violation in distance.violations})
+    if not pairs:
+        return "robots keep out of it by chance"
+    return f"{count(pairs, 'pair')} came closer than {distance.avoidance_radius:g} m"
 
 
 def _torques(one: _Shown) -> str:

@@ -39,7 +39,7 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
         yield f"  drives   not enabled at the end: {some(idle)}"
     if can.referee is not None:
         found = ", ".join(f"{number} {kind}" for kind, number in can.referee.kinds.items()) or "nothing wrong"
-        yield f"  referee  {can.referee.frames} frames: {found}"
+        yield f"  referee  {can.referee.frames} frames{can.referee.up_to}: {found}"
 
 
 def finding_text(referee: RefereeReport) -> str:

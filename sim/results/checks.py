@@ -88,7 +88,8 @@ def _whole(evidence: Evidence) -> Iterator[CheckResult]:
 
     at = "before it began" if end_s is None else f"at {end_s:g} s of {wanted_s:g} s"
     if run.failure:
-        yield told("failed", f"{run.failure.splitlines()[0]} ({at})")
+        what = run.failure.splitlines()[0]
+        yield told("failed", what if " at t = " in what else f"{what} ({at})")
         return
     if run.stopped:
         yield told("failed", f"the run was stopped {at}")
@@ -274,16 +275,28 @@ def _silence(evidence: Evidence) -> Iterator[CheckResult]:
     gaps = []
     for robot, each in zip(plan.robots, times, strict=True):
         if len(each):
-            gap_ns = max(int(np.diff(each).max(initial=0)), last_ns - int(each[-1]), int(each[0]))
-            gaps.append((gap_ns, robot))
+            spoken_ns = np.concatenate([[0], each, [max(last_ns, int(each[-1]))]])
+            widths_ns = np.diff(spoken_ns)
+            at = int(np.argmax(widths_ns))
+            gaps.append((int(widths_ns[at]), robot, int(spoken_ns[at])))
     if not gaps:
         yield CheckResult("silence", "failed", "no robot ever said anything", None, "s", plan.health.silence)
         return
-    gap_ns, robot = max(gaps, key=lambda found: (found[0], -found[1].index))
+    gap_ns, robot, from_ns = max(gaps, key=lambda found: (found[0], -found[1].index))
     bound_s = max(plan.health.silence, 2 * robot.period_ns / 1e9)
     outcome: Outcome = "failed" if gap_ns / 1e9 > bound_s else "passed"
-    text = f"{robot.name} said nothing for {gap_ns / 1e9:.4g} s, the longest of all robots"
+    text = (
+        f"{robot.name} said nothing for {gap_ns / 1e9:.4g} s from t = {from_ns / 1e9:g} s on, the longest of all robots"
+    )
+    text += _busy(evidence.run) if outcome == "failed" else ""
     yield CheckResult("silence", outcome, text, gap_ns / 1e9, "s", bound_s, (robot.name,))
+
+
+def _busy(run: RunFacts) -> str:
+    """Returns what may be why messages are missing on a wall clock, in words that follow others."""
+    if run.clock != "wall" or not run.late_stages:
+        return ""
+    return f"; {100 * run.late_stages / run.stages:.3g} % of stages were late: was the machine busy?"
 
 
 def _refused(evidence: Evidence) -> Iterator[CheckResult]:
@@ -336,21 +349,29 @@ def _referee(evidence: Evidence) -> Iterator[CheckResult]:
         yield CheckResult("referee", "not tested", "no frame was on the bus", unit="findings")
         return
     total = sum(can.referee.kinds.values())
-    text = finding_text(can.referee) if total else f"nothing breaks the contract in {can.referee.frames} frames"
+    text = (
+        finding_text(can.referee)
+        if total
+        else f"nothing breaks the contract in {can.referee.frames} frames{can.referee.up_to}"
+    )
     yield CheckResult("referee", "failed" if total else "passed", text, float(total), "findings", 0.0)
 
 
 def _recording(evidence: Evidence) -> Iterator[CheckResult]:
     plan, can = evidence.plan, evidence.can
-    missing = sum(
-        (int(times_ns[-1]) - int(times_ns[0])) // robot.period_ns + 1 - len(times_ns)
-        for robot, times_ns in zip(plan.robots, evidence.trace.times_ns, strict=True)
-        if len(times_ns)
-    )
+    missing, whose = 0, []
+    for robot, times_ns in zip(plan.robots, evidence.trace.times_ns, strict=True):
+        lacks = (int(times_ns[-1]) - int(times_ns[0])) // robot.period_ns + 1 - len(times_ns) if len(times_ns) else 0
+        if lacks:
+            missing += lacks
+            before_ns = int(times_ns[int(np.argmax(np.diff(times_ns) > robot.period_ns))])
+            whose.append(f"{lacks} of {robot.name} after t = {before_ns / 1e9:g} s")
     lost = (can.log_lost or 0) if can is not None else 0
     if missing or lost:
-        parts = [f"{missing} states"] * bool(missing) + [f"{lost} lines of can.log"] * bool(lost)
-        text = f"the recording lacks {' and '.join(parts)}"
+        parts = [f"{count(missing, 'state')} ({some(whose)})"] * bool(missing) + [f"{lost} lines of can.log"] * bool(
+            lost
+        )
+        text = f"the recording lacks {' and '.join(parts)}{_busy(evidence.run)}"
     else:
         text = "the recording lacks nothing"
     outcome: Outcome = "failed" if missing or lost else "passed"

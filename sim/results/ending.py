@@ -1,7 +1,8 @@
 """How the error of a block ended: at rest, falling, growing, oscillating, or with a steady lag.
 
-The last third of the run is looked at, in two halves: the sixth before the last, and the last.  The error *grows* if the root
-mean square of its amplitude (`rates`) is more than `health.growth` times as large in the last sixth as in the one before, and
+The last third of the run is looked at, in two halves: the sixth before the last, and the last.  The error *falls* if its
+amplitude (`rates`) is smaller in the last sixth than in the one before, and does not rise again in between.  It *grows* if the
+root mean square of its amplitude is more than `health.growth` times as large in the last sixth as in the one before, and
 larger than what is not judged: `health.floor`; what a moving formation cannot know, its speed times the ages of what it acts
 on (`ages`); and σ times what the velocity of the trajectory jumps by.  An error within 5 % of what the block started with may
 move from one steady value to another, or begin to tremble, with friction or steps of torque: it grows only if it grew in the
@@ -35,7 +36,11 @@ SMALL: Final = 0.05
 SIXTHS: Final = 6
 """Of a run"""
 FALLS: Final = 0.9
-"""An error that is less than so many times what it was a sixth of the run before falls"""
+"""An error whose amplitude is less than so many times what it was a sixth of the run before falls, if it never rises"""
+RISES: Final = 1.25
+"""An error rises where it is so many times its lowest before, in the last third of the run"""
+WINDOWS: Final = 6
+"""Of the last third: what is within a window is a ripple"""
 Kind = Literal["at rest", "falls", "grows", "oscillates", "steady lag", "steady error", "not finite", "too short"]
 
 
@@ -157,12 +162,19 @@ def _ending(
         rate = f", {-fit.rate:+.3g} 1/s" if fit is not None and fit.rate < 0 else ""
         how = "oscillates with growing amplitude" if oscillates else "diverges"
         return ended("grows", f"{how}: {earlier:.3g} m, then {level:.3g} m, {growth:.3g} times as much{rate}")
-    if growth < FALLS:
+    third = times_ns >= _part_ns(times_ns, 4)
+    if growth < FALLS and not _rises(sizes[third]):
         return ended("falls", f"still falls, to {end:.3g} m")
     if _constant(series.error, None, before, last, bound):
         return ended("steady error", f"keeps a steady error of {mean:.3g} m{beside}")
     if oscillates:
         return ended("oscillates", f"keeps oscillating at about {mean:.3g} m{beside}")
+    norm = series.norm[third]
+    if _rises(norm) and _rises(norm[::-1]):
+        low, high = float(norm.min()), float(norm.max())
+        return ended(
+            "oscillates", f"goes up and down between {low:.3g} m and {high:.3g} m in the last third of the run{beside}"
+        )
     return ended("steady error", f"stays at about {mean:.3g} m{beside}")
 
 
@@ -215,6 +227,13 @@ def _oscillates(series: BlockSeries, part: NDArray[np.bool_]) -> bool:
     along = error @ error[int(np.argmax(series.norm[part]))]
     signs = np.sign(along)
     return int(np.count_nonzero(np.diff(signs[signs != 0]))) >= 2
+
+
+def _rises(values: Array) -> bool:
+    """True if values rise again from their lowest: the largest in one of `WINDOWS` is more than `RISES` times what it was in
+    one before."""
+    peaks = np.array([float(part.max()) for part in np.array_split(values, WINDOWS) if len(part)])
+    return bool(len(peaks)) and bool((peaks > RISES * np.minimum.accumulate(peaks)).any())
 
 
 def _rms(values: Array) -> float:

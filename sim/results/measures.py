@@ -74,7 +74,7 @@ def separation_results(rows: Sequence[BlockResult], blocks: Blocks) -> tuple[Sep
             slower=_scale_name(slow, layers),
             sigma_ratio=slow_sigma / fast_sigma,
             rate_ratio=_rate_ratio(slow, fast),
-            rate_fit=min((row.decay_fit for row in (*slow, *fast) if row.decay_fit is not None), default=None),
+            rate_fit=_rate_fit([*slow, *fast]),
             settling_2_ratio=_ratio([row.settling_2 for row in slow], [row.settling_2 for row in fast]),
             settling_5_ratio=_ratio([row.settling_5 for row in slow], [row.settling_5 for row in fast]),
         )
@@ -83,11 +83,25 @@ def separation_results(rows: Sequence[BlockResult], blocks: Blocks) -> tuple[Sep
 
 
 def _rate_ratio(slow: Sequence[BlockResult], fast: Sequence[BlockResult]) -> float | None:
-    """Returns how many times as fast the slowest of the fast blocks decays as the slowest of the slow ones."""
+    """Returns how many times as fast the slowest of the fast blocks decays as the slowest of the slow ones; None where one does
+    not decay, or its rate cannot be told."""
+    if not _told_apart([*slow, *fast]):
+        return None
     times = [
         [1 / row.decay_rate if row.decay_rate and row.decay_rate > 0 else None for row in rows] for rows in (slow, fast)
     ]
     return _ratio(*times)
+
+
+def _rate_fit(rows: Sequence[BlockResult]) -> float | None:
+    """Returns the smallest r² of the blocks' fits."""
+    fits = [row.decay_fit for row in rows if row.decay_fit is not None]
+    return min(fits, default=None) if _told_apart(rows) else None
+
+
+def _told_apart(rows: Sequence[BlockResult]) -> bool:
+    """True if a run is long enough for the decay rates of blocks: the start of an oscillation is no decay."""
+    return all(row.ending not in ("too short", "not finite") for row in rows)
 
 
 def _ratio(slow: Sequence[float | None], fast: Sequence[float | None]) -> float | None:

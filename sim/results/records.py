@@ -15,6 +15,8 @@ FORMAT: Final = 3
 Outcome = Literal["passed", "failed", "not tested"]
 CLAIM: Final = "claim"
 """Name of the checks that are claims of the scenario"""
+CAUSES: Final = ("whole", "finite")
+"""Names of the checks whose failure is why others fail, or cannot be tested"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +57,12 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why the run fails: the sentences of what failed, and of claims that were not tested."""
-        return tuple(
-            f"{check.name}: {check.text}"
-            for check in self.checks
-            if check.outcome == "failed" or (check.outcome == "not tested" and check.name == CLAIM)
-        )
+        """Why the run fails: the sentences of what failed, and then of claims that were not tested.  First comes what is the
+        cause of others: the run broke off, or a state was not finite."""
+        failed = [check for check in self.checks if check.outcome == "failed"]
+        failed.sort(key=lambda check: check.name not in CAUSES)
+        untested = [check for check in self.checks if check.outcome == "not tested" and check.name == CLAIM]
+        return tuple(f"{check.name}: {check.text}" for check in (*failed, *untested))
 
     @property
     def not_tested(self) -> tuple[str, ...]:
@@ -161,9 +163,10 @@ class SeparationResult:
     slower: str
     sigma_ratio: float
     rate_ratio: float | None
-    """Decay rate of the faster over that of the slower, of each the slowest of its blocks; None if one does not decay"""
+    """Decay rate of the faster over that of the slower, of each the slowest of its blocks; None if one does not decay, or the
+    run is too short to tell"""
     rate_fit: float | None
-    """The smaller r² of the two fits"""
+    """The smallest r² of the fits; None where there is no ratio for lack of time"""
     settling_2_ratio: float | None
     """Settling time of the slower over that of the faster; other than a ratio of time scales, it depends on where they start"""
     settling_5_ratio: float | None

@@ -51,6 +51,26 @@ def test_processes_stop_with_the_same_states(in_process: tuple[dict[str, Any], P
     assert min(row["sent"] for row in summary["links"]) > 0  # what links counted is told though the run broke off
 
 
+@pytest.mark.parametrize("engine", ["inprocess", "processes"])
+def test_the_bus_of_a_stopped_run_is_judged_up_to_the_stop_and_the_cause_is_told_first(
+    engine: str, tmp_path: Path
+) -> None:
+    """Processes run ahead of the stop, some further than others: what they no longer send then is no finding."""
+    folder = tmp_path / "run"
+    delay = ("--set", "duration=2", "--set", "links=[{channel='state', delay=0.1}]")
+    done = echelon("run", "paper", "--engine", engine, *delay, "--no-report", "--out", folder)
+    assert done.returncode == 1, done.stderr
+    summary = summary_of(folder)
+    checks = {check["name"]: check for check in summary["verdict"]["checks"]}
+    assert checks["referee"]["outcome"] == "passed", checks["referee"]
+    stop = f"up to {summary['simulated']:g} s, where the run was stopped"
+    assert checks["referee"]["text"].endswith(stop)
+    assert summary["can"]["referee"]["until"] == summary["simulated"]
+    said = [line.split(maxsplit=2)[1] for line in done.stdout.splitlines() if line.startswith("  because  ")]
+    assert said[:2] == ["whole:", "finite:"]
+    assert main(["referee", str(folder)]) == 0  # who looks again finds nothing, either
+
+
 def test_keep_going_goes_on(in_process: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
     summary = ran("inprocess", tmp_path / "run", "--keep-going")
     assert summary["simulated"] == 2.0

@@ -337,7 +337,12 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     assert f" {RUNS[kind]}" in said
     assert "which runs mine.py:Mine" in said
     assert "Traceback" not in done.stderr
-    assert summary_of(folder / "run")["instants"] > 5
+    summary = summary_of(folder / "run")
+    assert summary["instants"] > 5
+    (reason,) = (reason for reason in reasons(summary) if reason.startswith("stalled"))
+    assert reason == said.removeprefix("echelon: ")  # which says once when it was
+    if "processes" in way:
+        assert f" at t = {summary['simulated']:g} s: " in said
     if "closed" in way:
         wheels_are_at_zero(folder / "run")
 

@@ -180,7 +180,8 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
     outcome = supervised(plan_of("paper", "duration=1000"), folder, show=watch, stall_timeout_s=5.0)
     assert any("everyone waits for g2/r5" in note and "stopped" in note for note in notes), notes
     assert outcome.failure is not None
-    assert outcome.failure.startswith("stalled")
+    until_s = outcome.trace.common()[0][-1] / 1e9
+    assert outcome.failure.startswith(f"stalled for 5 s at t = {until_s:g} s: ")
     assert not Path(f"/proc/{stopped[0]}").exists()
 
 

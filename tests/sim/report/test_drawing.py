@@ -1,14 +1,20 @@
 """How figures look: time where the action is, words beside curves, a second cue beside colour."""
 
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from echelon.bridge.protocols.registry import protocol_of
-from echelon.sim.report.comparison import longest
+from echelon.cli.new_scenario import scenario_text, sizes
+from echelon.sim.parts.loading import parse
+from echelon.sim.report.comparison import WIDTH, Compared, comparison, longest
 from echelon.sim.report.drawing import GROUPS, RUNS, Look, TimeAxis
-from echelon.sim.report.figures import PEAKS, TAUS, TorqueScale, distance_time, errors, torque_time
+from echelon.sim.report.figures import FIGURES, PEAKS, TAUS, TorqueScale, distance_time, errors, picture, torque_time
 from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances
@@ -42,6 +48,39 @@ def test_figures_of_torque_and_distance_end_when_all_is_calm(lab: Trace) -> None
     assert np.ptp(near.smallest[near.times_ns / 1e9 > ends]) < 0.04 * near.smallest[-1]
     shown, _ = time.thin(lab.times_ns[0], lab.states[0][:, 0])
     assert shown[-1] == time.last
+
+
+def test_the_closest_encounter_is_always_in_the_figure(lab: Trace) -> None:
+    near = distances(lab)
+    assert near.closest is not None
+    for t in (0, 3, 12, 39):
+        moved = replace(near, closest=replace(near.closest, time_ns=t * 1_000_000_000))
+        for time in (
+            distance_time(moved, lab.plan),
+            longest([distance_time(moved, lab.plan), TimeAxis(False, 0.01, 9, 9)]),
+        ):
+            assert time.shows(t), (t, time)
+
+
+def readme_scenario() -> str:
+    """Returns `my.toml` of the README."""
+    text = (Path(__file__).parents[3] / "README.md").read_text(encoding="utf-8")
+    return text.split("```toml\n", 1)[1].split("```", 1)[0]
+
+
+SCENARIOS = {groups: scenario_text("my", sizes(groups), None) for groups in ("1x1", "1x2", "2x3", "2,3,5")}
+
+
+@pytest.mark.parametrize("text", [*SCENARIOS.values(), readme_scenario()], ids=[*SCENARIOS, "README"])
+def test_no_figure_of_a_first_run_gives_a_warning(text: str) -> None:
+    """Whatever is drawn outside of the axes leaves no room for them."""
+    trace = trace_of(parse(text, "my.toml")[1])
+    blocks, near = block_series(trace), distances(trace)
+    alone = [picture(name, trace, blocks, width) for name in FIGURES for width in (WIDTH, WIDTH / 2)]
+    compared = [one for one, _ in comparison([Compared(name, trace, blocks, near) for name in "ab"]).values()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert all("</svg>" in one.svg for one in [*alone, *compared])
 
 
 def test_a_run_that_never_calms_is_shown_whole() -> None:

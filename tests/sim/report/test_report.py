@@ -22,6 +22,7 @@ from echelon.bridge.reports import (
 from echelon.planning.loading import effective_toml
 from echelon.sim.report.drawing import COLUMNS, thin
 from echelon.sim.report.report import RunForReport, write_report
+from echelon.sim.results.records import count
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
 from support.synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
@@ -123,10 +124,24 @@ def test_ids_are_unique_or_repeat_the_same_thing(both):
 
 
 def test_every_figure_has_words_for_those_who_do_not_see_it(single, both):
-    for page, count in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):
+    for page, figures in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):
         labels = [value for tag, key, value in page.attributes if (tag, key) == ("svg", "aria-label")]
-        assert page.tags.count("svg") == len(labels) == count
+        assert page.tags.count("svg") == len(labels) == figures
         assert all(len(label) > 20 for label in labels)
+
+
+@pytest.mark.parametrize("radius", [6.0, 0.01])
+def test_the_caption_of_distances_says_what_the_table_below_says(radius, tmp_path):
+    made = decaying(["duration=1.0", f"avoidance={{enabled=false, avoidance_radius={radius}, sensing_radius=7.0}}"])
+    one = for_report(made, "near")
+    pairs = {violation.pair for violation in one.summary.distance.violations}
+    assert bool(pairs) is (radius == 6.0)
+    text = rendered([one], tmp_path / "report.html").text
+    said = {
+        True: f"not enabled: {count(len(pairs), 'pair')} came closer than 6 m.",
+        False: "robots keep out of it by chance.",
+    }
+    assert [words in text for words in said.values()] == [bool(pairs), not pairs]
 
 
 def test_verdict_claims_and_numbers_are_on_the_page(single):

@@ -242,6 +242,18 @@ def test_bounds_are_the_scenarios():
     assert only(judged(decaying(0.1, "health.late=0.2"), run=facts), "late").outcome == "passed"
 
 
+def test_what_is_missing_has_its_robot_its_time_and_on_a_busy_machine_the_likely_cause():
+    trace = without(without(decaying(), 3, slice(100, 160)), 1, slice(500, 501))
+    busy = {"clock": "wall", "stages": 200, "late_stages": 9}
+    for facts, cause in (({}, ""), (busy, "; 4.5 % of stages were late: was the machine busy?")):
+        summary = judged(trace, run=run_facts(**facts))
+        silent, lacking = only(summary, "silence").text, only(summary, "recording").text
+        assert silent == f"g2/r4 said nothing for 0.61 s from t = 0.99 s on, the longest of all robots{cause}"
+        whose = "1 of g1/r2 after t = 4.99 s, 60 of g2/r4 after t = 0.99 s"
+        assert lacking == f"the recording lacks 61 states ({whose}){cause}"
+    assert "busy" not in only(judged(decaying(), run=run_facts(**busy)), "silence").text
+
+
 def test_nothing_is_late_in_virtual_time_and_no_drive_is_judged_where_torque_is_mirrored():
     names = {check.name for check in judged(decaying()).verdict.checks}
     assert not names & {"late", "drives", "distance"}

@@ -134,6 +134,34 @@ def test_every_ending_has_its_name_and_its_words(error, kind, words):
     assert ending.spared == ""
 
 
+PHASES = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (lambda t, phase: 0.3 * np.cos(2 * t) * (1 + 0.8 * np.cos(0.8 * t + phase)), "keeps oscillating at about"),
+        (lambda t, phase: 0.23 + 0.14 * np.cos(0.9 * t + phase), "goes up and down between 0.09"),
+        (lambda t, phase: 0.3 * np.cos(0.9 * t + phase), "keeps oscillating at about"),
+    ],
+    ids=["beat", "offset", "limit cycle"],
+)
+def test_what_goes_up_and_down_in_the_last_third_does_not_fall_whatever_its_phase(error, words, phase):
+    ending = ended_as(lambda t: error(t, phase))
+    if ending.kind != "grows":
+        assert ending.kind == "oscillates", ending
+        assert ending.text.startswith(words)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("rate", [0.05, 0.3])
+def test_a_decay_with_a_ripple_falls(rate, phase):
+    falling = ended_as(lambda t: 0.5 * np.exp(-rate * t) * (1 + 0.1 * np.cos(5 * t + phase)))
+    swinging = ended_as(lambda t: 0.5 * np.exp(-rate * t) * np.cos(3 * t + phase))
+    assert (falling.kind, swinging.kind) == ("falls", "falls"), (falling, swinging)
+
+
 def test_growth_is_the_ratio_of_the_last_two_sixths():
     """Of e^(ct) it is e^(cT/6)."""
     # The last one has an instant more, of 400.

@@ -103,6 +103,15 @@ def test_scales_of_their_own_are_compared_one_by_one():
     assert rows[-1]["settling_5_ratio"] is None  # the centroid does not settle in 2 s
 
 
+@pytest.mark.parametrize(("duration", "told"), [(9.5, True), (8.5, False), (0.5, False)])
+def test_no_decay_rates_are_compared_in_a_run_that_is_too_short_for_its_blocks(duration, told):
+    """The centroid's dwell time is 3 s, and a third of the run must be as long."""
+    record = record_of(decaying([f"duration={duration}", NO_CLAIMS]).trace)
+    row = record.separation[-1]
+    assert (row.slower, row.rate_ratio is not None, row.rate_fit is not None) == ("centroid", told, told)
+    assert ("centroid over inter: – times as slow" in summary_text(record)) is not told
+
+
 def test_claims_that_hold_make_a_verdict_that_holds(summary):
     assert [claim["outcome"] for claim in summary["claims"]] == ["passed"] * 3
     assert summary["claims"][0]["blocks"].keys() == {"g1", "g2", "g3"}

@@ -29,6 +29,7 @@ from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, 
 from echelon.messages import Channel
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.punctuality import with_punctuality
 
 CHANNELS: Final = (Channel.STATE, Channel.GROUP_STATE, Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
 """Of the links that a scenario's rules are about; the others stand for shafts and buses"""
@@ -61,7 +62,7 @@ def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:
             return link
         return replace(link, delay_min_ns=link.delay_min_ns + extra_ns, delay_max_ns=link.delay_max_ns + extra_ns)
 
-    return replace(plan, links=tuple(map(longer, plan.links)))
+    return replace(plan, links=tuple(with_punctuality(list(map(longer, plan.links)), plan.nodes)))
 
 
 def ruled_links(plan: Plan, channel: Channel) -> list[LinkPlan]:

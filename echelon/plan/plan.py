@@ -49,6 +49,9 @@ class RobotPlan:
     torque_period_ns: int
     drive: DrivePlan
     envelope: EnvelopePlan
+    event_driven: bool = True
+    """True if it takes an acceleration when it arrives; False if only at the beginning of its period (docs/architecture.md,
+    4.3)"""
 
     @property
     def name(self) -> str:
@@ -86,6 +89,9 @@ class NodePlan:
     depth: int
     period_ns: int
     shape: ShapePlan
+    event_driven: bool = True
+    """True if it acts when it has heard something newer; False if only at the beginning of its period (docs/architecture.md,
+    4.3)"""
 
     @property
     def name(self) -> str:
@@ -152,11 +158,18 @@ class LinkPlan:
     """Run time of message number 0; negative between bridge and drives, which bring the drives up before run time 0"""
     size: int | None = None
     """Number of values of a message that is not null (echelon.plan.layout); None: any number"""
+    punctual: bool = True
+    """True if its source always sends at the nominal instants (docs/architecture.md, 4.3)"""
 
     @property
     def ideal(self) -> bool:
         """True if the link has no delay and no loss: a message is in use from the instant at which it is sent."""
         return self.delay_max_ns == 0 and self.loss == 0.0
+
+    @property
+    def prompt(self) -> bool:
+        """True if each message is in use from its nominal instant on: the link is ideal, and its source is punctual."""
+        return self.punctual and self.ideal
 
 
 @dataclass(frozen=True, slots=True)

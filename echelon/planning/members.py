@@ -13,7 +13,7 @@ from echelon.planning import shapes
 from echelon.planning.drives import DriveMaker, make_can
 from echelon.plugins import Part, Registry
 from echelon.scenario.can_tables import DriveTable
-from echelon.scenario.tables import Group, RobotTable, Scenario, Shape
+from echelon.scenario.tables import EVENT_DRIVEN, Group, RobotTable, Scenario, Shape, Timing
 from echelon.scenario.values import Table
 
 ROBOT_DEFAULTS: Final[dict[str, Any]] = {
@@ -54,7 +54,7 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
         closed=can.closed,
         default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
-    walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
+    walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot, scenario.timing)
     walk.check()
     return walk.drives.placed(walk.robots), tuple(walk.nodes), can
 
@@ -119,10 +119,11 @@ class _Walk:
             self._mistakes.lines.append(f"{keys[0]}{text}{same}")
         self._mistakes.check(PlanError)
 
-    def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
-        """Adds a group and everything below it; returns its node.  `inherited` are the values of the groups around it."""
+    def add_group(self, group: Group, place: _Place, inherited: RobotTable, timing: Timing) -> NodePlan:
+        """Adds a group and everything below it; returns its node.  `inherited` and `timing` are of the groups around it."""
         index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
         first_robot = len(self.robots)
+        timing = group.timing or timing
         inherited = _overlaid(inherited, group.robot)
         period_key = "periods.acceleration" if group.period is None else f"{place.key}.period"
         period_ns = self._acceleration_ns if group.period is None else 0
@@ -141,13 +142,13 @@ class _Walk:
             children.append(len(self.robots))
             weights.append(1)
             try:
-                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
+                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns, timing))
             except PlanError as error:
                 for line in error.lines:
                     self._robot_mistakes.setdefault(line.removeprefix(at.key), []).append(at.key)
         for name, sub in group.groups.items():
             at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
-            child = self.add_group(sub, at, inherited)
+            child = self.add_group(sub, at, inherited, timing)
             children.append(child.index)
             weights.append(child.robots)
             with self._mistakes.noted():
@@ -170,13 +171,14 @@ class _Walk:
             depth=place.depth,
             period_ns=period_ns,
             shape=shape,
+            event_driven=timing == EVENT_DRIVEN,
         )
         self.nodes.append(node)
         return node
 
-    def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
+    def _robot(self, table: RobotTable, place: _Place, period_ns: int, timing: Timing) -> RobotPlan:
         """Returns a robot from its table, inherited values included.  Raises PlanError."""
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive", "timing"})
         if lacking := [needed for needed in NEEDED if needed not in values]:
             nowhere = "missing (neither here, nor in its group, nor in [robot])"
             raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
@@ -200,6 +202,7 @@ class _Walk:
             period_ns=period_ns,
             torque_period_ns=self._torque_ns,
             model=table.model or self._default_plant,
+            event_driven=(table.timing or timing) == EVENT_DRIVEN,
             **values,
         )
 

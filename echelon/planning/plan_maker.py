@@ -28,6 +28,7 @@ from echelon.plan.plan import (
     PlanError,
     RobotPlan,
 )
+from echelon.plan.punctuality import with_punctuality
 from echelon.planning.blocks import fitting, make_blocks, make_coupling
 from echelon.planning.drives import make_events
 from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
@@ -177,7 +178,7 @@ def _links(
     unused = [_why_unused(rule, f"links.{at}", names, can.closed) for at, rule in enumerate(rules) if at not in used]
     if unused:
         raise PlanError(*unused)
-    return (*links, *_shaft_links(robots, bus_roles, can))
+    return (*with_punctuality(links, nodes), *_shaft_links(robots, bus_roles, can))
 
 
 def _torque_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan]) -> list[tuple[int, int, Channel, int]]:

@@ -5,7 +5,7 @@ robot's own table.  `echelon.planning.loading` reads files, applies overrides an
 `echelon.planning.plan_maker` makes the plan that roles work with; `echelon.scenario.can_tables` has the tables of the CAN bus.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
@@ -44,6 +44,10 @@ RESERVED_NAMES = ("coordinator", "bridge", "drives", "recorder", "referee")
 """Names of processes.  Robots and groups cannot have these names."""
 
 
+EVENT_DRIVEN: Final = "event_driven"
+Timing = Literal["event_driven", "time_driven"]
+
+
 class Periods(Table):
     """The periods of the run."""
 
@@ -76,6 +80,8 @@ class RobotTable(Table):
     """Position of the reference point at the start [m]; must be given.  The robot starts at rest"""
     heading: Finite | None = None
     """θ, heading at the start, counter-clockwise from the x axis [rad]; 0 unless given"""
+    timing: Timing | None = None
+    """When it takes an acceleration; `timing` of its group unless given"""
     torque_limit: Limit | None = None
     """Largest torque of a wheel [N m]; unlimited unless given"""
     torque_rate_limit: Limit | None = None
@@ -136,6 +142,8 @@ class Group(Table):
     """Its child groups by name"""
     period: Positive | None = None
     """Acceleration period of this node [s]: a multiple of its child groups' periods; `periods.acceleration` unless given"""
+    timing: Timing | None = None
+    """When this node, its robots and the groups below it act; `timing` of the group around it unless given"""
 
     @model_validator(mode="after")
     def _children(self) -> "Group":
@@ -351,6 +359,11 @@ class Scenario(Table):
     """Seed of all random draws: delays, losses, error frames"""
     periods: Periods = Periods()
     """The periods of accelerations and torques"""
+    timing: Timing = EVENT_DRIVEN
+    """When nodes and robots act, unless a group or a robot says otherwise (docs/architecture.md, 4.3).  `event_driven`: in each
+    of its periods a node acts as soon as every input has something newer, at the latest at the end of the period, and a robot
+    takes an acceleration when it arrives.  `time_driven`: they act at the beginning of each period with what has arrived, so
+    any delay costs at least a period.  On the closed torque path robots take accelerations when a torque period begins"""
     robot: RobotTable = RobotTable()
     """Values that all robots share"""
     formation: Group

@@ -19,7 +19,7 @@ def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
 
 
 class TimeOrder:
-    """Orders messages by (time, source, channel).  A message is released when every source has sent a later one.
+    """Orders messages by (time, source, channel, sequence).  A message is released when every source has sent a later one.
 
     Each source sends in order of time.  The order of the released messages does not depend on the order of arrival.
     """
@@ -60,7 +60,7 @@ class TimeOrder:
         released: list[Message] = []
         for time_ns in sorted(time_ns for time_ns in self._waiting if time_ns < safe_ns):
             bucket = self._waiting.pop(time_ns)
-            bucket.sort(key=lambda message: (message.source, message.channel))
+            bucket.sort(key=lambda message: (message.source, message.channel, message.sequence))
             released.extend(bucket)
             self._released_ns = time_ns
         return released

@@ -25,7 +25,7 @@ class Robot:
     """One robot of a plan, where torque is mirrored: it moves with the torques that it computes.
 
     It computes torques at the beginning of each torque period.  An event-driven robot takes an acceleration in the instant of
-    its arrival, and computes torques anew for the rest of the torque period (docs/architecture.md, 4.3).  The motion up to an
+    its arrival, and computes torques anew for the rest of the torque period (docs/architecture.md, 4.6).  The motion up to an
     instant is computed when it is needed: when the robot sends its state, and when an acceleration arrives."""
 
     def __init__(self, plan: Plan, index: int) -> None:

@@ -51,7 +51,7 @@ class RobotPlan:
     envelope: EnvelopePlan
     event_driven: bool = True
     """True if it takes an acceleration when it arrives; False if only at the beginning of its period (docs/architecture.md,
-    4.3)"""
+    4.6)"""
 
     @property
     def name(self) -> str:
@@ -91,7 +91,7 @@ class NodePlan:
     shape: ShapePlan
     event_driven: bool = True
     """True if it acts when it has heard something newer; False if only at the beginning of its period (docs/architecture.md,
-    4.3)"""
+    4.6)"""
 
     @property
     def name(self) -> str:
@@ -159,7 +159,7 @@ class LinkPlan:
     size: int | None = None
     """Number of values of a message that is not null (echelon.plan.layout); None: any number"""
     punctual: bool = True
-    """True if its source always sends at the nominal instants (docs/architecture.md, 4.3)"""
+    """True if its source always sends at the nominal instants (docs/architecture.md, 4.6)"""
 
     @property
     def ideal(self) -> bool:

@@ -1,4 +1,4 @@
-"""Which messages are always sent at their nominal instants (docs/architecture.md, 4.3).
+"""Which messages are always sent at their nominal instants (docs/architecture.md, 4.6).
 
 A robot sends its state at the beginning of each period.  A time-driven node sends at the beginning of its period, too.  An
 event-driven node does so if whatever it waits for is there at once: if all links that it hears are ideal, and their sources

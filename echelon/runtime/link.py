@@ -10,7 +10,7 @@ has arrived is *in use*; a message that was overtaken arrives, but changes nothi
 loss, a message arrives when it is sent, and nothing is drawn.
 
 Message number k is due at the *nominal* instant first + k × period.  A sender that waits for its own inputs sends it later,
-but always before number k + 1 is due (docs/architecture.md, 4.3).  So a receiver knows without the message that it cannot
+but always before number k + 1 is due (docs/architecture.md, 4.6).  So a receiver knows without the message that it cannot
 arrive before its nominal instant plus its delay; this look-ahead lets a lockstep run on while messages are on their way.  The
 link of a *punctual* sender, which always sends at its nominal instants, is ideal at best: then number ⌊(t - first)/period⌋ is
 in use at t.

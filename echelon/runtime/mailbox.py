@@ -98,8 +98,10 @@ class Mailbox:
         }
         self._stages = role.stages
         self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
-        self.prompt = [all(slot.plan.prompt for slot in slots) for slots in self._stage_slots]
-        """For each stage, whether all its inputs are on prompt links.  Then it acts at its nominal instants"""
+        heard_at_once = [all(slot.plan.prompt for slot in slots) for slots in self._stage_slots]
+        self.prompt = [all(heard_at_once[: number + 1]) for number in range(len(heard_at_once))]
+        """For each stage, whether its inputs and those of the stages before it are all on prompt links.  Then it acts at its
+        nominal instants"""
         self._acted_ns = -1 << 62
         """Instant of the role's last act"""
         self.unexpected = 0
@@ -152,7 +154,6 @@ class Mailbox:
         """Returns the acts of a stage in its period from `time_ns` on.  In a lockstep no message is missing when this is
         called."""
         if self.prompt[stage]:
-            self._acted_ns = time_ns = max(time_ns, self._acted_ns)
             return [(time_ns, self.take(stage, time_ns))]
         of, slots = self._stages[stage], self._stage_slots[stage]
         last_ns = _last_ns(of, time_ns)

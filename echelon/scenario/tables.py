@@ -360,7 +360,7 @@ class Scenario(Table):
     periods: Periods = Periods()
     """The periods of accelerations and torques"""
     timing: Timing = EVENT_DRIVEN
-    """When nodes and robots act, unless a group or a robot says otherwise (docs/architecture.md, 4.3).  `event_driven`: in each
+    """When nodes and robots act, unless a group or a robot says otherwise (docs/architecture.md, 4.6).  `event_driven`: in each
     of its periods a node acts as soon as every input has something newer, at the latest at the end of the period, and a robot
     takes an acceleration when it arrives.  `time_driven`: they act at the beginning of each period with what has arrived, so
     any delay costs at least a period.  On the closed torque path robots take accelerations when a torque period begins"""

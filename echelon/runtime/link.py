@@ -1,49 +1,34 @@
-"""The link model: which message a receiver uses at a given instant (docs/architecture.md, 4.1 and 4.2).
+"""The link: which message a receiver uses at a given instant (docs/architecture.md, 4.1 and 4.2).
 
-Every triple (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is lost, and how
-long it takes, is a pure function of (scenario seed, link, k).  So the same messages are lost in every engine, at every speed
-and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key stands for the link, the
-counter for the message, so any draw can be made without the draws before it.
+Every triple (source, receiver, channel) has one link, applied at the receiver.  What becomes of a message is told by
+`echelon.runtime.fates`.
 
 A receiver uses a message at its first instant at or after the arrival.  The newest message that has arrived is *in use*; a
 message that was overtaken arrives, but changes nothing.  On an *ideal* link, without delay and loss, the newest message that
 was sent is in use, and nothing is drawn.
 """
 
-import hashlib
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-import numpy as np
-from numpy.random import Philox
-
-from echelon.messages import Channel, Values
+from echelon.messages import Channel
 from echelon.plan.plan import LinkPlan
+from echelon.runtime.ages import AgeCounts
+from echelon.runtime.fates import Fates
 
-_BLOCK: Final = 512
-"""Messages per block of draws.  A message takes two 64-bit words; each count of the Philox counter gives four words."""
-
-
-def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
-    """Returns the 128-bit Philox key of a link in a scenario."""
-    name = f"{seed}|{source}|{receiver}|{channel.name}".encode()
-    return int.from_bytes(hashlib.blake2b(name, digest_size=16).digest(), "little")
-
-
-def draws(key: int, block: int) -> Values:
-    """Returns the draws of a block, uniform in [0, 1), shape (_BLOCK, 2): for each message its loss and its delay."""
-    words = Philox(key=key, counter=block * (_BLOCK // 2)).random_raw(2 * _BLOCK)
-    uniform: Values = np.multiply(words >> np.uint64(11), 2.0**-53)
-    return uniform.reshape(_BLOCK, 2)
+PERCENTILES: Final = (0.5, 0.95, 0.99)
+"""The shares of uses whose largest age is told"""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkCounts:
     """Counts of a link's messages; sent = delivered + lost + in_flight.
 
-    `used` counts uses.  `held` counts the uses in which the message was older than the instant and had been used before.
-    `age_mean_ns` and `age_max_ns` are the mean and the largest age of the message in use, over all uses."""
+    A message is delivered when its first copy arrives.  `duplicates` counts the second copies that have arrived.  `used` counts
+    uses.  `held` counts the uses in which the message was older than the instant and had been used before.  The ages are those
+    of the message in use, over all uses: mean, largest, and the ages that half, 95 % and 99 % of the uses do not exceed
+    (echelon.runtime.ages)."""
 
     source: int
     receiver: int
@@ -56,6 +41,10 @@ class LinkCounts:
     held: int
     age_mean_ns: float
     age_max_ns: int
+    age_p50_ns: int = 0
+    age_p95_ns: int = 0
+    age_p99_ns: int = 0
+    duplicates: int = 0
 
 
 class Link:
@@ -64,16 +53,19 @@ class Link:
     __slots__ = (
         "_age_max",
         "_age_sum",
-        "_block",
-        "_block_number",
+        "_aged",
+        "_ages",
+        "_copies",
         "_delivered",
         "_due_ns",
+        "_duplicates",
+        "_fates",
         "_first_ns",
         "_flying",
         "_held",
         "_ideal",
-        "_key",
         "_last",
+        "_latest_ns",
         "_lost",
         "_newest",
         "_period_ns",
@@ -84,38 +76,34 @@ class Link:
 
     def __init__(self, plan: LinkPlan, seed: int, source: str, receiver: str) -> None:
         self.plan = plan
-        self._key = link_key(seed, source, receiver, plan.channel)
+        self._fates = Fates(plan, seed, source, receiver)
         self._ideal = plan.ideal
         self._first_ns, self._period_ns = plan.first_ns, plan.period_ns
-        self._block: list[list[float]] = []
-        self._block_number = -1
         self._due_ns = plan.first_ns  # when the next message is sent
-        self._sent = self._delivered = self._lost = self._used = self._held = 0
+        self._latest_ns = plan.first_ns  # the latest arrival so far, of first copies
+        self._sent = self._delivered = self._duplicates = self._lost = self._used = self._held = 0
         self._newest = self._last = -1
         self._flying: list[tuple[int, int]] = []
-        self._age_sum = self._age_max = 0
+        self._copies: list[int] = []  # arrivals of second copies
+        self._age_sum = self._age_max = self._aged = 0
+        self._ages = AgeCounts()
 
     def sent_ns(self, sequence: int) -> int:
         """Returns the instant at which message number `sequence` is sent [ns]."""
         return self._first_ns + sequence * self._period_ns
 
     def fate(self, sequence: int) -> int | None:
-        """Returns the delay [ns] of message number `sequence`, or None if it is lost."""
-        plan = self.plan
-        if self._ideal:
-            return 0
-        number, at = divmod(sequence, _BLOCK)
-        if number != self._block_number:
-            self._block, self._block_number = draws(self._key, number).tolist(), number
-        loss, delay = self._block[at]
-        if loss < plan.loss:
-            return None
-        return plan.delay_min_ns + round(delay * (plan.delay_max_ns - plan.delay_min_ns))
+        """Returns the delay [ns] of the first copy of message number `sequence`, or None if it is lost."""
+        return min(self._fates.of(sequence, self.sent_ns(sequence)), default=None)
 
     def arrived(self, sequence: int, time_ns: int) -> bool:
         """True if message number `sequence` is not lost and has arrived by `time_ns`."""
+        if self.sent_ns(sequence) > time_ns:
+            return False
         delay = self.fate(sequence)
-        return delay is not None and self.sent_ns(sequence) + delay <= time_ns
+        if delay is None or self.sent_ns(sequence) + delay > time_ns:
+            return False
+        return not self.plan.fifo or all(number != sequence for _, number in self._flying)
 
     def newest(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
@@ -123,17 +111,25 @@ class Link:
             self._newest = newest = (time_ns - self._first_ns) // self._period_ns
             return newest
         while self._due_ns <= time_ns:
-            delay = self.fate(self._sent)
-            if delay is None:
+            arrivals = sorted(self._due_ns + delay for delay in self._fates.of(self._sent, self._due_ns))
+            if not arrivals:
                 self._lost += 1
             else:
-                heappush(self._flying, (self._due_ns + delay, self._sent))
+                if self.plan.fifo:
+                    arrivals = [max(arrival, self._latest_ns) for arrival in arrivals]
+                    self._latest_ns = arrivals[0]
+                heappush(self._flying, (arrivals[0], self._sent))
+                for arrival in arrivals[1:]:
+                    heappush(self._copies, arrival)
             self._sent += 1
             self._due_ns += self._period_ns
         while self._flying and self._flying[0][0] <= time_ns:
             _, sequence = heappop(self._flying)
             self._delivered += 1
             self._newest = max(self._newest, sequence)
+        while self._copies and self._copies[0] <= time_ns:
+            heappop(self._copies)
+            self._duplicates += 1
         return self._newest
 
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
@@ -143,6 +139,8 @@ class Link:
             age = time_ns - sent_ns
             self._held += sequence == self._last
             self._age_sum += age
+            self._aged += 1
+            self._ages.note(age)
             if age > self._age_max:
                 self._age_max = age
         self._last = sequence
@@ -152,6 +150,7 @@ class Link:
         sent, delivered = self._sent, self._delivered
         if self._ideal:
             sent = delivered = self._newest + 1
+        p50, p95, p99 = self._ages.percentiles(PERCENTILES, self._used - self._aged)
         return LinkCounts(
             self.plan.source,
             self.plan.receiver,
@@ -164,4 +163,8 @@ class Link:
             self._held,
             self._age_sum / self._used if self._used else 0.0,
             self._age_max,
+            min(p50, self._age_max),
+            min(p95, self._age_max),
+            min(p99, self._age_max),
+            self._duplicates,
         )

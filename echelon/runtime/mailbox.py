@@ -4,12 +4,14 @@ At time t a stage needs from each input the message that the link says is in use
 having seen the message.  So the mailbox knows which messages are still missing, and a stage gets the same messages whatever
 the order, the speed and the process in which they came.  This makes the lockstep (docs/architecture.md, 3.3).
 
-A message older than its link's timeout (policy `hold_then_stop`) is not used: the stage gets None.
+A message older than its link's timeout is not used: the stage gets None (policy `hold_then_stop`) or zeros (policy `zero`).
 """
 
 from dataclasses import dataclass, field
 from math import gcd
 from typing import Final
+
+import numpy as np
 
 from echelon.messages import Heard, Message
 from echelon.plan.plan import LinkPlan, Plan
@@ -117,8 +119,11 @@ class Mailbox:
                 elif len(newer) > slot.capacity:
                     slot.newer = {each: newer[each] for each in newer if link.fate(each) is not None}
             current = slot.current
-            if current is None or not current.values.size or time_ns - current.time_ns > slot.plan.timeout_ns:
+            if current is None or not current.values.size:
                 heard.append(None)
+            elif time_ns - current.time_ns > slot.plan.timeout_ns:
+                zeros = slot.plan.policy == "zero"
+                heard.append(current._replace(values=np.zeros(current.values.size)) if zeros else None)
             else:
                 link.note_use(time_ns, current.sequence, current.time_ns)
                 heard.append(current)

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from echelon.messages import Channel
 from echelon.plan.plan import LinkPlan
-from echelon.runtime.link import Link, draws, link_key
+from echelon.runtime.fates import draws, link_key
+from echelon.runtime.link import Link
 
 MS = 1_000_000
 UNIFORM = LinkPlan(0, 9, Channel.STATE, MS, MS, 3 * MS, 0.1)
@@ -196,10 +197,10 @@ OTHERS = [
 @pytest.mark.parametrize("other", OTHERS)
 def test_links_are_independent(other):
     count = 20_000
-    one = draws(made()._key, 0)
-    assert not np.array_equal(one, draws(other._key, 0))
+    one = draws(made()._fates.key, 0)
+    assert not np.array_equal(one, draws(other._fates.key, 0))
     blocks = range(count // 512)
-    here, there = (np.concatenate([draws(link._key, block) for block in blocks]) for link in (made(), other))
+    here, there = (np.concatenate([draws(link._fates.key, block) for block in blocks]) for link in (made(), other))
     for column in (0, 1):
         assert abs(np.corrcoef(here[:, column], there[:, column])[0, 1]) < 4 / np.sqrt(count)
 

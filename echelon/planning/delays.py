@@ -47,8 +47,8 @@ def delays_of(rule: LinkRule, key: str) -> tuple[int, int, DelayTable | DelayTra
         raise PlanError(f"{at} = {high}: must be at most {MAX_DELAY:g}")
     if isinstance(delay, Normal) and delay.min - delay.mean > MAX_CUT * delay.std:
         raise PlanError(
-            f"{key}.min = {delay.min}: cuts off all but the last of the distribution; must be at most mean + "
-            f"{MAX_CUT:g} std = {delay.mean + MAX_CUT * delay.std:g}"
+            f"{key}: min = {delay.min} cuts off nearly everything; must be at most mean + {MAX_CUT:g} std = "
+            f"{delay.mean + MAX_CUT * delay.std:g}"
         )
     if isinstance(delay, float | int) or (isinstance(delay, Uniform) and not delay.correlation):
         return round(low * 1e9), round(high * 1e9), None

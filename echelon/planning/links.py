@@ -56,6 +56,8 @@ def make_links(
     mistakes = Mistakes()
     made: list[_Made] = []
     for at, rule in enumerate(rules):
+        if rule.name is not None and rule.name in [other.name for other in rules[:at]]:
+            mistakes.lines.append(f"links.{at}.name = {rule.name!r}: is the name of another rule")
         with mistakes.noted():
             made.append(_made(rule, f"links.{at}"))
     mistakes.check(PlanError)

@@ -337,10 +337,3 @@ class Scenario(Table):
     """Limits of the checks that are made of every run"""
     events: list[Event] = []
     """Scheduled events: faults of drives, emergency stops, disturbances of a bus, blackouts of links, members cut off"""
-
-    @model_validator(mode="after")
-    def _names(self) -> "Scenario":
-        names = [rule.name for rule in self.links if rule.name is not None]
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"links: {twice[0]!r} is the name of more than one")
-        return self

@@ -174,6 +174,17 @@ class LinkPlan:
     """True: no message arrives before those that were sent before it"""
     blackouts: Windows = ()
     """Windows of time [ns]; what is sent in them is lost"""
+    source_clock: ClockPlan = TRUE_CLOCK
+    """The clock by which messages are stamped"""
+    receiver_clock: ClockPlan = TRUE_CLOCK
+    """The clock by which the receiver reads their age"""
+
+    def read_age_ns(self, time_ns: int, sent_ns: int) -> int:
+        """Returns the age [ns] that a receiver reads at `time_ns` off a message sent at `sent_ns`: the true age if both clocks
+        show the run time."""
+        if self.source_clock is self.receiver_clock is TRUE_CLOCK:
+            return time_ns - sent_ns
+        return self.receiver_clock.reading_ns(time_ns) - self.source_clock.reading_ns(sent_ns)
 
     @property
     def ideal(self) -> bool:

@@ -10,7 +10,7 @@ from typing import Final
 from echelon.errors import Mistakes
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan
-from echelon.plan.delay_tables import Bursts, DelayTable, DelayTrace, merged
+from echelon.plan.delay_tables import TRUE_CLOCK, Bursts, DelayTable, DelayTrace, merged
 from echelon.plan.plan import LinkPlan, NodePlan, PlanError, RobotPlan
 from echelon.planning.delays import delays_of
 from echelon.scenario.link_tables import Blackout, CutOff, LinkRule
@@ -53,6 +53,7 @@ def make_links(
     Raises PlanError if a rule or an event fits no link, or a rule does not fit its links."""
     all_roles: list[RobotPlan | NodePlan | BusRolePlan] = [*robots, *nodes, *bus_roles]
     names = [one.name for one in all_roles]
+    clocks = [TRUE_CLOCK if isinstance(one, BusRolePlan) else one.clock for one in all_roles]
     mistakes = Mistakes()
     made: list[_Made] = []
     for at, rule in enumerate(rules):
@@ -63,14 +64,15 @@ def make_links(
     mistakes.check(PlanError)
     used: set[str] = set()
     wrong: dict[str, str] = {}
-    links = []
+    links: list[LinkPlan] = []
     plain = _made(LinkRule(), "")
     for source, receiver, channel, period_ns in [*_tree_links(robots, nodes), *_torque_links(robots, bus_roles)]:
         fitting = [each for each in made if _fits(each.rule, names[source], names[receiver], channel)]
         used.update(each.key for each in fitting)
         says = fitting[-1] if fitting else plain
         try:
-            links.append(_link(says, source, receiver, channel, period_ns, can))
+            link = _link(says, source, receiver, channel, period_ns, can)
+            links.append(replace(link, source_clock=clocks[source], receiver_clock=clocks[receiver]))
         except PlanError as error:
             wrong.setdefault(says.key, error.lines[0])
     unused = [_why_unused(each.rule, each.key, names, can.closed) for each in made if each.key not in used]

@@ -102,7 +102,18 @@ def bad_states(draws: Values, bursts: Bursts, first: bool) -> tuple[NDArray[np.b
 class Fates:
     """What becomes of the messages of one link."""
 
-    __slots__ = ("_block", "_fixed", "_later", "_loss_key", "_number", "_states", "_table", "_z_ends", "key", "plan")
+    __slots__ = (
+        "_block",
+        "_fixed",
+        "_loss_key",
+        "_number",
+        "_states",
+        "_table",
+        "_z_ends",
+        "by_instant",
+        "key",
+        "plan",
+    )
 
     def __init__(self, plan: LinkPlan, seed: int, source: str, receiver: str) -> None:
         self.plan = plan
@@ -121,19 +132,23 @@ class Fates:
             (plan.delay_min_ns,) if constant and not plan.loss and not plan.duplicates else None
         )
         """The copies of every message, where they are the same for all"""
-        self._later = bool(plan.blackouts) or (isinstance(plan.delays, DelayTrace) and bool(plan.delays.times_ns))
-        """True if the instant of sending matters"""
+        self.by_instant = bool(plan.blackouts) or (isinstance(plan.delays, DelayTrace) and bool(plan.delays.times_ns))
+        """True if the instant of sending matters: then `of` differs from `drawn`"""
 
     def of(self, sequence: int, sent_ns: int) -> Copies:
         """Returns the delays [ns] of the copies of message number `sequence`, which is sent at `sent_ns`."""
+        copies = self.drawn(sequence)
+        return self._at_instant(copies, sent_ns) if self.by_instant and copies else copies
+
+    def drawn(self, sequence: int) -> Copies:
+        """Returns what the number of a message alone says: no copies if it is lost whenever it is sent.  With a trace by time,
+        delays are 0."""
         if self._fixed is not None:
-            copies = self._fixed
-        else:
-            number, at = divmod(sequence, BLOCK)
-            if number != self._number:
-                self._block, self._number = _as_tuples(self.block(number)), number
-            copies = self._block[at]
-        return self._at_instant(copies, sent_ns) if self._later and copies else copies
+            return self._fixed
+        number, at = divmod(sequence, BLOCK)
+        if number != self._number:
+            self._block, self._number = _as_tuples(self.block(number)), number
+        return self._block[at]
 
     def block(self, number: int) -> Words:
         """Returns the delays [ns] of a block, shape (BLOCK, 2): of each message, and of its copy if it comes twice; `LOST`

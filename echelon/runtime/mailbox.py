@@ -121,7 +121,7 @@ class Mailbox:
             current = slot.current
             if current is None or not current.values.size:
                 heard.append(None)
-            elif time_ns - current.time_ns > slot.plan.timeout_ns:
+            elif slot.plan.read_age_ns(time_ns, current.time_ns) > slot.plan.timeout_ns:
                 zeros = slot.plan.policy == "zero"
                 heard.append(current._replace(values=np.zeros(current.values.size)) if zeros else None)
             else:

@@ -1,9 +1,14 @@
-"""The parts that others wrote, kept in a run's folder: its scenario.toml runs again there, wherever they came from."""
+"""The files that a scenario names, kept in a run's folder: parts that others wrote, and traces of delays.
 
+So the scenario.toml of the folder runs again there, wherever the files came from.
+"""
+
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from echelon.plugins import Source
+from echelon.scenario.link_tables import Trace
 from echelon.scenario.part_fields import parts_in
 from echelon.scenario.tables import Scenario
 from echelon.sim.results.records import PartResult
@@ -11,7 +16,7 @@ from echelon.sim.results.records import PartResult
 
 @dataclass(frozen=True, slots=True)
 class KeptParts:
-    """What is kept of a scenario's parts."""
+    """What is kept of the files that a scenario names."""
 
     names: dict[Source, str]
     """What each file is called in the folder"""
@@ -29,20 +34,24 @@ class KeptParts:
         return {f"sha256 of {name}": source.sha256 for source, name in self.names.items()}
 
 
-def keep_parts(scenario: Scenario, folder: Path) -> KeptParts:
-    """Copies the files of a scenario's parts into a folder; returns what they are called there.  Raises OSError.
+def keep_parts(scenario: Scenario, folder: Path, reserved: Iterable[str] = ()) -> KeptParts:
+    """Copies the files that a scenario names into a folder; returns what they are called there.  Raises OSError.
 
-    A file keeps its name unless another part's file, or another file that is there already, has it: nothing is overwritten."""
+    A file keeps its name unless another one of them, or another file that is there already, has it, or it is `reserved`:
+    nothing is overwritten."""
     names: dict[Source, str] = {}
     results: dict[str, PartResult] = {}
     for part in parts_in(scenario):
         if part.source is not None:
             if part.source not in names:
-                names[part.source] = _copied(part.source, folder, set(names.values()))
+                names[part.source] = _copied(part.source, folder, {*names.values(), *reserved})
             name, use = names[part.source], part.use.rpartition(":")[2]
             results[f"{name}:{use}"] = PartResult(f"{name}:{use}", name, part.source.sha256)
         elif not part.is_own:
             results[part.use] = PartResult(part.use, None, None)
+    for rule in scenario.links:
+        if isinstance(rule.delay, Trace) and rule.delay.file not in names:
+            names[rule.delay.file] = _copied(rule.delay.file, folder, {*names.values(), *reserved})
     return KeptParts(names, tuple(results.values()))
 
 

@@ -33,7 +33,7 @@ from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import interruption
 from echelon.sim.kept_parts import keep_parts
-from echelon.sim.out_folder import SUMMARY, OutFolder
+from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
 from echelon.sim.processes.supervisor import Outcome, Progress, Supervisor
@@ -67,7 +67,7 @@ def execute(
     A run ends at the first instant at which a robot's state is not finite, unless it is to `keep_going`.
     Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
     begun, folder = datetime.now(UTC), out.path
-    parts = keep_parts(scenario, folder)
+    parts = keep_parts(scenario, folder, (NOTE, *run_files(plan, bus=True)))
     toml = effective_toml(scenario, parts.names)
     out.note((), {EFFECTIVE: toml, **parts.files})
     write_text(folder / EFFECTIVE, toml)

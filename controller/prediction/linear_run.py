@@ -52,7 +52,7 @@ class Loop:
 
 def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
     """Returns the links that are no part of a linear map: their messages are lost at times, or take different times."""
-    return tuple(link for link in plan.links if link.loss > 0 or link.delay_min_ns != link.delay_max_ns)
+    return tuple(link for link in plan.links if not link.steady)
 
 
 def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:

@@ -156,7 +156,7 @@ def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ..
     for at, part in enumerate(location, start=1):
         if members := _members(annotation):
             member = members[str(part)]
-            if at < len(location) or _is_model(member):
+            if at < len(location) or _is_model(member) or _members(member):
                 annotation = member
             continue  # a plain value: the type stays the union, so that all its members are offered
         keys.append(part)

@@ -8,11 +8,13 @@ from typing import Any, Final, TypeVar
 
 from echelon.errors import Mistakes
 from echelon.plan.can_plan import CanPlan
+from echelon.plan.delay_tables import TRUE_CLOCK, ClockPlan
 from echelon.plan.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.planning import shapes
 from echelon.planning.drives import DriveMaker, make_can
 from echelon.plugins import Part, Registry
 from echelon.scenario.can_tables import DriveTable
+from echelon.scenario.link_tables import Clock
 from echelon.scenario.tables import EVENT_DRIVEN, Group, RobotTable, Scenario, Shape, Timing
 from echelon.scenario.values import Table
 
@@ -172,13 +174,14 @@ class _Walk:
             period_ns=period_ns,
             shape=shape,
             event_driven=timing == EVENT_DRIVEN,
+            clock=_clock(group.clock),
         )
         self.nodes.append(node)
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int, timing: Timing) -> RobotPlan:
         """Returns a robot from its table, inherited values included.  Raises PlanError."""
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive", "timing"})
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive", "clock", "timing"})
         if lacking := [needed for needed in NEEDED if needed not in values]:
             nowhere = "missing (neither here, nor in its group, nor in [robot])"
             raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
@@ -203,8 +206,14 @@ class _Walk:
             torque_period_ns=self._torque_ns,
             model=table.model or self._default_plant,
             event_driven=(table.timing or timing) == EVENT_DRIVEN,
+            clock=_clock(table.clock),
             **values,
         )
+
+
+def _clock(table: Clock | None) -> ClockPlan:
+    """Returns the clock of a process."""
+    return TRUE_CLOCK if table is None else ClockPlan(round((table.offset or 0.0) * 1e9), table.drift or 0.0)
 
 
 _T = TypeVar("_T", bound=Table)

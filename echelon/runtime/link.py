@@ -1,56 +1,39 @@
-"""The link model: when each message arrives at its receiver (docs/architecture.md, 4.1 and 4.2).
+"""The link: when each message arrives at its receiver, and which one is in use (docs/architecture.md, 4.1 and 4.2).
 
-Every triple (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is lost, and how
-long it takes, is a pure function of (scenario seed, link, k).  So the same messages are lost in every engine, at every speed
-and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key stands for the link, the
-counter for the message, so any draw can be made without the draws before it.
-
-A message arrives its delay after the instant at which it was sent, which is the time in its header.  The newest message that
-has arrived is *in use*; a message that was overtaken arrives, but changes nothing.  On an *ideal* link, without delay and
-loss, a message arrives when it is sent, and nothing is drawn.
+Every triple (source, receiver, channel) has one link, applied at the receiver.  What becomes of a message is told by
+`echelon.runtime.fates`.  A message arrives its delay after the instant at which it was sent, which is the time in its header.
+The newest message that has arrived is *in use*; a message that was overtaken arrives, but changes nothing.
 
 Message number k is due at the *nominal* instant first + k × period.  A sender that waits for its own inputs sends it later,
 but always before number k + 1 is due (docs/architecture.md, 4.6).  So a receiver knows without the message that it cannot
-arrive before its nominal instant plus its delay; this look-ahead lets a lockstep run on while messages are on their way.  The
-link of a *punctual* sender, which always sends at its nominal instants, is ideal at best: then number ⌊(t - first)/period⌋ is
-in use at t.
+arrive before its nominal instant plus its delay.  This look-ahead lets a lockstep run on while messages are on their way.
+
+On a *prompt* link, which is ideal and whose sender always sends at nominal instants, a message is in use from its nominal
+instant on, and nothing is drawn.
 """
 
-import hashlib
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-import numpy as np
-from numpy.random import Philox
-
-from echelon.messages import Channel, Message, Values
+from echelon.messages import Channel, Message
 from echelon.plan.plan import LinkPlan
+from echelon.runtime.ages import AgeCounts
+from echelon.runtime.fates import Copies, Fates
 
-_BLOCK: Final = 512
-"""Messages per block of draws.  A message takes two 64-bit words; each count of the Philox counter gives four words."""
-
-
-def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
-    """Returns the 128-bit Philox key of a link in a scenario."""
-    name = f"{seed}|{source}|{receiver}|{channel.name}".encode()
-    return int.from_bytes(hashlib.blake2b(name, digest_size=16).digest(), "little")
-
-
-def draws(key: int, block: int) -> Values:
-    """Returns the draws of a block, uniform in [0, 1), shape (_BLOCK, 2): for each message its loss and its delay."""
-    words = Philox(key=key, counter=block * (_BLOCK // 2)).random_raw(2 * _BLOCK)
-    uniform: Values = np.multiply(words >> np.uint64(11), 2.0**-53)
-    return uniform.reshape(_BLOCK, 2)
+PERCENTILES: Final = (0.5, 0.95, 0.99)
+"""The shares of uses whose largest age is told"""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkCounts:
     """Counts of a link's messages; sent = delivered + lost + in_flight.
 
-    `used` counts uses.  `held` counts the uses in which the message was older than the instant and had been used before.
-    `age_mean_ns` and `age_max_ns` are the mean and the largest age of the message in use, over all uses."""
+    A message is delivered when its first copy arrives.  `duplicates` counts the second copies that have arrived.  `used` counts
+    uses.  `held` counts the uses in which the message was older than the instant and had been used before.  The ages are those
+    of the message in use, over all uses: mean, largest, and the ages that half, 95 % and 99 % of the uses do not exceed
+    (echelon.runtime.ages)."""
 
     source: int
     receiver: int
@@ -63,6 +46,10 @@ class LinkCounts:
     held: int
     age_mean_ns: float
     age_max_ns: int
+    age_p50_ns: int = 0
+    age_p95_ns: int = 0
+    age_p99_ns: int = 0
+    duplicates: int = 0
 
 
 class Link:
@@ -71,16 +58,18 @@ class Link:
     __slots__ = (
         "_age_max",
         "_age_sum",
-        "_block",
-        "_block_number",
+        "_aged",
+        "_ages",
+        "_copies",
         "_delivered",
+        "_duplicates",
         "_expected",
+        "_fates",
         "_first_ns",
         "_flying",
         "_held",
-        "_ideal",
-        "_key",
         "_last",
+        "_latest_ns",
         "_lost",
         "_newest",
         "_open",
@@ -92,18 +81,20 @@ class Link:
 
     def __init__(self, plan: LinkPlan, seed: int, source: str, receiver: str) -> None:
         self.plan = plan
-        self._key = link_key(seed, source, receiver, plan.channel)
-        self._ideal = plan.ideal
+        self._fates = Fates(plan, seed, source, receiver)
         self._first_ns, self._period_ns = plan.first_ns, plan.period_ns
-        self._block: list[list[float]] = []
-        self._block_number = -1
-        self._sent = self._delivered = self._lost = self._used = self._held = 0
+        self._latest_ns = plan.first_ns
+        """The latest arrival so far, of first copies"""
+        self._sent = self._delivered = self._duplicates = self._lost = self._used = self._held = 0
         self._newest = self._last = self._expected = -1
         self._open: list[tuple[int, int]] = []
-        """Messages that are due, not lost, and not in `_flying` yet: number and delay"""
+        """Messages that are due, not lost, and not in `_flying` yet, by number: number and earliest possible arrival"""
         self._flying: list[tuple[int, int]] = []
         """Messages on their way, as a heap: instant of arrival and number"""
-        self._age_sum = self._age_max = 0
+        self._copies: list[int] = []
+        """Arrivals of second copies, as a heap"""
+        self._age_sum = self._age_max = self._aged = 0
+        self._ages = AgeCounts()
 
     def due(self, time_ns: int) -> int:
         """Returns the number of the last message that is due at `time_ns`, or a negative number before the first one."""
@@ -113,48 +104,46 @@ class Link:
         """Returns the nominal instant of message number `sequence` [ns]: it is sent then, or later."""
         return self._first_ns + sequence * self._period_ns
 
-    def fate(self, sequence: int) -> int | None:
-        """Returns the delay [ns] of message number `sequence`, or None if it is lost."""
-        plan = self.plan
-        if self._ideal:
-            return 0
-        number, at = divmod(sequence, _BLOCK)
-        if number != self._block_number:
-            self._block, self._block_number = draws(self._key, number).tolist(), number
-        loss, delay = self._block[at]
-        if loss < plan.loss:
-            return None
-        return plan.delay_min_ns + round(delay * (plan.delay_max_ns - plan.delay_min_ns))
+    def is_lost(self, sequence: int) -> bool:
+        """Returns whether message number `sequence` is lost, as far as that can be told without its instant of sending."""
+        return not self._known(sequence)
+
+    def _known(self, sequence: int) -> Copies:
+        """Returns the delays of the copies of a message, as far as they can be told without its instant of sending."""
+        if self.plan.punctual:
+            return self._fates.of(sequence, self.sent_ns(sequence))
+        return self._fates.drawn(sequence)
 
     def due_by(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns` on a prompt link: the last one that is due."""
         self._newest = newest = (time_ns - self._first_ns) // self._period_ns
         return newest
 
-    def take_up(self, time_ns: int, until_ns: int, came: Mapping[int, Message], in_use: int) -> bool:
+    def take_up(self, time_ns: int, until_ns: int, came: dict[int, Message], in_use: int) -> bool:
         """Takes up the messages that are due at `time_ns` and may arrive by `until_ns`; returns True if none of them is
         missing.
 
-        `came` has the messages that have come, by number, from number `in_use` + 1 on."""
+        `came` has the messages that have come, by number, from number `in_use` + 1 on.  Those that a blackout takes away are
+        removed from it."""
         self._open_due(time_ns)
         if not self._open:
             return True
-        complete, still_open = True, []
-        for number, delay in self._open:
-            arrives_ns = self._first_ns + number * self._period_ns + delay
-            if arrives_ns <= until_ns and number > in_use:
-                message = came.get(number)
-                if message is None:
-                    complete = False
-                    arrives_ns = until_ns + 1
-                else:
-                    arrives_ns = message.time_ns + delay
-                    heappush(self._flying, (arrives_ns, number))
-                    continue
-            if arrives_ns <= until_ns:  # it was overtaken, and changes nothing
-                heappush(self._flying, (arrives_ns, number))
-            else:
-                still_open.append((number, delay))
+        complete, fifo = True, self.plan.fifo
+        still_open: list[tuple[int, int]] = []
+        for at, (number, earliest_ns) in enumerate(self._open):
+            if fifo and still_open:  # it cannot arrive before those that were sent before it
+                still_open += self._open[at:]
+                break
+            if earliest_ns > until_ns:
+                still_open.append((number, earliest_ns))
+            elif number <= in_use:  # it was overtaken, and changes nothing
+                heappush(self._flying, (earliest_ns, number))
+            elif (message := came.get(number)) is None:
+                complete = False
+                still_open.append((number, earliest_ns))
+            elif not self._depart(message):
+                self._lost += 1
+                del came[number]
         self._open = still_open
         return complete
 
@@ -162,40 +151,60 @@ class Link:
         """Draws the fates of the messages that are due at `time_ns`."""
         last = (time_ns - self._first_ns) // self._period_ns
         while self._sent <= last:
-            delay = self.fate(self._sent)
-            if delay is None:
-                self._lost += 1
+            copies = self._known(self._sent)
+            if copies:
+                self._open.append((self._sent, self.sent_ns(self._sent) + min(copies)))
             else:
-                self._open.append((self._sent, delay))
+                self._lost += 1
             self._sent += 1
+
+    def _depart(self, message: Message, received_ns: int | None = None) -> bool:
+        """Puts a message on its way; returns False if it is lost.  It arrives at `received_ns` at the earliest."""
+        sent_ns = message.time_ns
+        arrivals: Sequence[int] = [sent_ns + delay for delay in self._fates.of(message.sequence, sent_ns)]
+        if not arrivals:
+            return False
+        if len(arrivals) > 1:
+            arrivals = sorted(arrivals)
+        if received_ns is not None:
+            arrivals = [max(received_ns, arrival) for arrival in arrivals]
+        if self.plan.fifo:
+            arrivals = [max(self._latest_ns, arrival) for arrival in arrivals]
+            self._latest_ns = arrivals[0]
+        heappush(self._flying, (arrivals[0], message.sequence))
+        for arrival in arrivals[1:]:
+            heappush(self._copies, arrival)
+        return True
 
     def expected(self, time_ns: int) -> int:
         """Returns the number of the newest message that would have arrived by `time_ns` if all were sent when they are due."""
         self._open_due(time_ns)
         if self._open:
             still_open = []
-            for number, delay in self._open:
-                if self.sent_ns(number) + delay > time_ns:
-                    still_open.append((number, delay))
+            for number, earliest_ns in self._open:
+                if earliest_ns > time_ns:
+                    still_open.append((number, earliest_ns))
                 elif number > self._expected:
                     self._expected = number
             self._open = still_open
         return self._expected
 
-    def receive(self, message: Message, time_ns: int) -> None:
-        """Takes a message that comes at `time_ns` of a wall clock: it arrives then, or after the delay of its link."""
-        delay = self.fate(message.sequence)
-        if delay is not None:
-            heappush(self._flying, (max(time_ns, message.time_ns + delay), message.sequence))
+    def receive(self, message: Message, time_ns: int) -> bool:
+        """Takes a message that comes at `time_ns` of a wall clock: it arrives then, or after the delay of its link.  Returns
+        False if it is lost."""
+        return self._depart(message, time_ns)
 
     def newest(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived, of those that were taken up."""
-        flying = self._flying
+        flying, copies = self._flying, self._copies
         while flying and flying[0][0] <= time_ns:
             _, sequence = heappop(flying)
             self._delivered += 1
             if sequence > self._newest:
                 self._newest = sequence
+        while copies and copies[0] <= time_ns:
+            heappop(copies)
+            self._duplicates += 1
         return self._newest
 
     def next_arrival(self, than: int) -> int | None:
@@ -209,6 +218,8 @@ class Link:
             age = time_ns - sent_ns
             self._held += sequence == self._last
             self._age_sum += age
+            self._aged += 1
+            self._ages.note(age)
             if age > self._age_max:
                 self._age_max = age
         self._last = sequence
@@ -218,6 +229,7 @@ class Link:
         sent, delivered = self._sent, self._delivered
         if self.plan.prompt:
             sent = delivered = self._newest + 1
+        p50, p95, p99 = self._ages.percentiles(PERCENTILES, self._used - self._aged)
         return LinkCounts(
             self.plan.source,
             self.plan.receiver,
@@ -230,4 +242,8 @@ class Link:
             self._held,
             self._age_sum / self._used if self._used else 0.0,
             self._age_max,
+            min(p50, self._age_max),
+            min(p95, self._age_max),
+            min(p99, self._age_max),
+            self._duplicates,
         )

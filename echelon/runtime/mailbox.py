@@ -1,5 +1,5 @@
 """The mailbox: takes messages in any order, and says when each stage of a role acts, and with which messages
-(docs/architecture.md, 3.3 and 4.3).
+(docs/architecture.md, 3.3 and 4.6).
 
 A stage is *due* at each multiple of its period, its nominal instant.  When it acts depends on its `Acts`:
 
@@ -23,12 +23,14 @@ In virtual time the link knows from the number of a message whether it is lost a
 which messages are still missing, and a stage gets the same messages at the same instants whatever the order, the speed and the
 process in which they came.  This makes the lockstep.
 
-A message older than its link's timeout (policy `hold_then_stop`) is not used: the stage gets None.
+A message older than its link's timeout is not used: the stage gets None (policy `hold_then_stop`) or zeros (policy `zero`).
 """
 
 from dataclasses import dataclass, field, replace
 from math import gcd
 from typing import Final
+
+import numpy as np
 
 from echelon.messages import Heard, Message
 from echelon.plan.can_plan import NEVER_NS
@@ -72,9 +74,11 @@ class _Slot:
                     for overtaken in range(self.in_use + 1, number):
                         newer.pop(overtaken, None)
                 self.current, self.in_use = message, number
-        current = self.current
-        if current is None or not current.values.size or time_ns - current.time_ns > self.plan.timeout_ns:
+        current, plan = self.current, self.plan
+        if current is None or not current.values.size:
             return None
+        if plan.timeout_ns != NEVER_NS and plan.read_age_ns(time_ns, current.time_ns) > plan.timeout_ns:
+            return current._replace(values=np.zeros(current.values.size)) if plan.policy == "zero" else None
         self.link.note_use(time_ns, current.sequence, current.time_ns)
         return current
 
@@ -129,7 +133,7 @@ class Mailbox:
             return None
         if number > slot.newest:
             slot.newest = number
-        if number <= slot.in_use or (not plan.prompt and slot.link.fate(number) is None):
+        if number <= slot.in_use or (not plan.prompt and slot.link.is_lost(number)):
             return None
         return slot
 
@@ -199,9 +203,9 @@ class WallMailbox(Mailbox):
 
     def receive(self, message: Message, time_ns: int) -> None:
         """Takes a message that comes at `time_ns`.  Messages of no link and of a wrong size are counted and dropped."""
-        if (slot := self._place(message)) is not None and message.sequence not in slot.newer:
+        slot = self._place(message)
+        if slot is not None and message.sequence not in slot.newer and slot.link.receive(message, time_ns):
             slot.newer[message.sequence] = message
-            slot.link.receive(message, time_ns)
 
     def ready(self, stage: int, time_ns: int, deadline_ns: int) -> tuple[int, bool]:
         """Returns when a stage that is due at `time_ns` acts if nothing further comes, and whether it then misses a message.
@@ -250,7 +254,7 @@ def _change_ns(slot: _Slot, time_ns: int) -> int:
     change_ns = NEVER_NS if arrives_ns is None else arrives_ns
     current = slot.current
     if current is not None and current.values.size and slot.plan.timeout_ns < NEVER_NS:
-        expires_ns = current.time_ns + slot.plan.timeout_ns + 1
+        expires_ns = slot.plan.expires_ns(current.time_ns)
         if time_ns < expires_ns < change_ns:
             return expires_ns
     return change_ns

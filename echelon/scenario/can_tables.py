@@ -196,4 +196,4 @@ class BusOff(Table):
     bus-off"""
 
 
-Event = Annotated[DriveFault | Estop | ErrorFrames | BusOff, Field(discriminator="kind")]
+CanEvent = DriveFault | Estop | ErrorFrames | BusOff

@@ -69,7 +69,7 @@ DEFINITIONS: Final = {
     "echelon_msgs/Wheels": _HEADER + "float64[] torques\n",
     "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
     "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
-    "float64 age_mean_ns\nint64 age_max_ns\n",
+    "float64 age_mean_ns\nint64 age_max_ns\nint64 age_p50_ns\nint64 age_p95_ns\nint64 age_p99_ns\nuint64 duplicates\n",
 }
 """Message definitions by name, without the middle part `msg`.  Types of fields are written with their package."""
 
@@ -292,5 +292,7 @@ def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:
     """Returns an echelon_msgs/LinkStatistics; `name` is the link in words."""
     layout = Layout().header("").put("I", counts.source, counts.receiver).put("B", counts.channel).string(name)
     layout.put("Q", counts.sent, counts.delivered, counts.lost, counts.in_flight, counts.used, counts.held)
-    layout.put("d", counts.age_mean_ns).put("q", counts.age_max_ns)
+    layout.put("d", counts.age_mean_ns)
+    layout.put("q", counts.age_max_ns, counts.age_p50_ns, counts.age_p95_ns, counts.age_p99_ns)
+    layout.put("Q", counts.duplicates)
     return stamp(time_ns) + bytes(layout.body[8:])

@@ -355,13 +355,26 @@ def _can(one: _Shown) -> str:
 
 def _links(one: _Shown) -> str:
     links = one.run.summary.links
-    head = ["link", "channel", "sent", "lost", "in flight", "held", "mean age", "largest"]
+    head = [
+        "link",
+        "channel",
+        "sent",
+        "lost",
+        "in flight",
+        "twice",
+        "held",
+        "mean age [s]",
+        "p50",
+        "p95",
+        "p99",
+        "largest",
+    ]
     rows = [
         [
             f"{row.source} → {row.receiver}",
             row.channel.replace("_", " "),
-            *(row.sent, row.lost, row.in_flight, row.held),
-            *(f"{row.age_mean:.4g}", f"{row.age_max:.4g}"),
+            *(row.sent, row.lost, row.in_flight, row.duplicates, row.held),
+            *map(number, (row.age_mean, row.age_p50, row.age_p95, row.age_p99, row.age_max)),
         ]
         for row in links[:MAX_ROWS]
     ]

@@ -221,21 +221,31 @@ class TorqueResult:
 
 @dataclass(frozen=True, slots=True)
 class LinkResult:
-    """What became of a link's messages; sent = delivered + lost + in_flight."""
+    """What became of a link's messages; sent = delivered + lost + in_flight.
+
+    The ages are those of what was in use, at each use [s]; None if nothing was ever used."""
 
     source: str
     receiver: str
     channel: str
     sent: int
     delivered: int
+    """Messages of which a first copy has arrived"""
     lost: int
     in_flight: int
+    duplicates: int
+    """Second copies of messages that have arrived"""
     used: int
     """Uses of a message"""
     held: int
     """Uses of a message that had been used before, after the instant it was sent in"""
     age_mean: float | None
-    """Of what was in use, at each use [s]; None if nothing was ever used"""
+    age_p50: float | None
+    """Not exceeded in half of the uses"""
+    age_p95: float | None
+    """Not exceeded in 95 % of the uses"""
+    age_p99: float | None
+    """Not exceeded in 99 % of the uses"""
     age_max: float | None
 
 

@@ -94,9 +94,17 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
     if summary.links:
         sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
-        ages = [link.age_max for link in summary.links if link.age_max is not None]
-        oldest = f"oldest in use {number(max(ages), 's')}" if ages else "nothing was ever used"
-        yield f"  links    {sent} messages, {lost} lost, {oldest}"
+        used = [link for link in summary.links if link.age_max is not None and link.age_p99 is not None]
+        oldest = (
+            f"oldest in use {number(max(link.age_max or 0.0 for link in used), 's')}"
+            if used
+            else "nothing was ever used"
+        )
+        if any(link.age_p99 != link.age_max for link in used):
+            worst = max(used, key=lambda link: link.age_p99 or 0.0)
+            oldest += f"; 99 % of uses up to {number(worst.age_p99, 's')} ({worst.source} → {worst.receiver})"
+        twice = sum(link.duplicates for link in summary.links)
+        yield f"  links    {sent} messages, {lost} lost{f', {twice} twice' if twice else ''}, {oldest}"
     yield from can_lines(summary.can)
     run = summary.run
     if run.clock == "wall" and run.stages:

@@ -346,7 +346,7 @@ def test_where_the_torque_path_is_closed_a_late_torque_is_a_late_command():
     assert radius_of(closed) == pytest.approx(radius_of(mirrored), abs=1e-12)
     expected = largest_extra_delay(mirrored, Channel.COMMAND)
     for channel in (Channel.COMMAND, Channel.TORQUE):
-        assert largest_extra_delay(closed, channel) == expected
+        assert largest_extra_delay(closed, channel) == replace(expected, beyond_s=0.0)  # taken at torque periods
     assert not ruled_links(mirrored, Channel.TORQUE)
 
 

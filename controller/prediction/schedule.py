@@ -15,6 +15,7 @@ import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.messages import Channel, Heard, Message
+from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.mailbox import Mailbox
@@ -82,7 +83,8 @@ class _DryRun:
         self._hyperperiod_ns = plan.root.period_ns
         self._tick_ns = gcd(*(stage.period_ns for stage in stages))
         self._now_ns = 0
-        plan = replace(plan, links=tuple(replace(link, size=None) for link in plan.links))
+        links = tuple(replace(link, size=None, blackouts=()) for link in plan.links)
+        plan = replace(plan, links=links, duration_ns=NEVER_NS)
         self._periods = {(link.source, link.channel): link.period_ns for link in plan.links}
         of_member: dict[int, list[TimedStage]] = {}
         for stage in stages:

@@ -368,9 +368,8 @@ class Runner:
         """Runs a stage that is due in a lockstep, and sends its messages; returns True if this completes a batch of copies."""
         complete = False
         for at_ns, heard in self.mailbox.acts(number, self._time_ns):
-            if at_ns <= self.plan.duration_ns:
-                for message in stage.run(at_ns, heard):
-                    complete |= self._send(message)
+            for message in stage.run(at_ns, heard):
+                complete |= self._send(message)
         return complete
 
     def _send(self, message: Message) -> bool:

@@ -124,11 +124,10 @@ class Engine:
     def act(
         self, time_ns: int, number: int, run: Callable[[int, Sequence[Heard]], tuple[Message, ...]], mailbox: Mailbox
     ) -> None:
-        """Lets a stage act that is due at `time_ns`, as often as it does in its period, up to the end of the run."""
+        """Lets a stage act that is due at `time_ns`, as often as it does in its period."""
         for at_ns, heard in mailbox.acts(number, time_ns):
-            if at_ns <= self.plan.duration_ns:
-                for message in run(at_ns, heard):
-                    self.post(message)
+            for message in run(at_ns, heard):
+                self.post(message)
 
     def post(self, message: Message) -> None:
         """Hands a message to all its receivers."""

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.messages import NULL, Channel, Message
+from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import LinkPlan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.mailbox import Mailbox, WallMailbox
@@ -26,6 +27,7 @@ class _Plan:
 
     links: tuple[LinkPlan, ...]
     seed: int
+    duration_ns: int = NEVER_NS
     all_roles: tuple[Any, ...] = tuple(SimpleNamespace(name=f"m{index}") for index in range(RECEIVER + 1))
 
     def links_into(self, receiver: int) -> tuple[LinkPlan, ...]:

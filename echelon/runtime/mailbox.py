@@ -177,7 +177,67 @@ class Mailbox:
         self._acted_ns = acts[-1][0]
         return acts
 
-    def _heard_ns(slot: _Slot, time_ns: int, at_ns: int, last_ns: int) -> int:
+    def _last_ns(self, stage: Stage, time_ns: int) -> int:
+        """Returns the last instant at which a stage may act that is due at `time_ns`: none acts after the end of the run."""
+        if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT):
+            return time_ns
+        return max(time_ns, min(time_ns + stage.period_ns - 1, self._end_ns))
+
+    def take(self, stage: int, time_ns: int) -> list[Heard]:
+        """Returns the messages in use at `time_ns`, one for each input of the stage; None where no message is in use."""
+        heard: list[Heard] = []
+        for slot in self._stage_slots[stage]:
+            link = slot.link
+            heard.append(slot.hear(link.due_by(time_ns) if slot.plan.prompt else link.newest(time_ns), time_ns))
+        return heard
+
+    def next_change(self, stage: int, time_ns: int) -> int:
+        """Returns the first instant after `time_ns` at which a stage hears something newer, or at which a message in use
+        becomes too old; `NEVER_NS` if there is none."""
+        return min((_change_ns(slot, time_ns) for slot in self._stage_slots[stage]), default=NEVER_NS)
+
+    def counts(self) -> list[LinkCounts]:
+        """Returns the counts of every link into this role."""
+        return [slot.link.counts() for slot in self._slots.values()]
+
+
+class WallMailbox(Mailbox):
+    """All inputs of one role on a wall clock.  Instants are run time, and a message arrives when it really comes, or later if
+    the scenario gives its link a delay."""
+
+    def __init__(self, role: Role, plan: Plan) -> None:
+        super().__init__(role, replace(plan, links=tuple(replace(link, punctual=False) for link in plan.links)))
+
+    def receive(self, message: Message, time_ns: int) -> None:
+        """Takes a message that comes at `time_ns`.  Messages of no link and of a wrong size are counted and dropped."""
+        slot = self._place(message)
+        if slot is not None and message.sequence not in slot.newer and slot.link.receive(message, time_ns):
+            slot.newer[message.sequence] = message
+
+    def ready(self, stage: int, time_ns: int, deadline_ns: int) -> tuple[int, bool]:
+        """Returns when a stage that is due at `time_ns` acts if nothing further comes, and whether it then misses a message.
+
+        `deadline_ns` is the deadline of its turn, for a stage that acts in turn."""
+        of, slots = self._stages[stage], self._stage_slots[stage]
+        expected = [slot.link.expected(time_ns) for slot in slots]
+        if of.acts is Acts.IN_TURN:
+            missed = any(
+                number > slot.in_use and number not in slot.newer for slot, number in zip(slots, expected, strict=True)
+            )
+            return (deadline_ns, True) if missed else (time_ns, False)
+        if of.acts is not Acts.WHEN_HEARD:
+            return time_ns, False
+        at_ns, last_ns = time_ns, self._last_ns(of, time_ns)
+        for slot in slots:
+            at_ns = max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns))
+        return min(at_ns, last_ns), at_ns >= last_ns and self.misses(stage, time_ns)
+
+    def misses(self, stage: int, time_ns: int) -> bool:
+        """Returns whether a message that is due at `time_ns` is neither in use nor here."""
+        return any(slot.link.due(time_ns) > slot.in_use and not slot.newer for slot in self._stage_slots[stage])
+
+
+def _heard_ns(slot: _Slot, time_ns: int, at_ns: int, last_ns: int) -> int:
     """Returns the first instant from `at_ns` on at which an input has something newer than is in use, at the latest `last_ns`.
 
     It is `at_ns` if nothing newer is due at `time_ns`."""

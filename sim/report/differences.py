@@ -13,8 +13,10 @@ RUN_KEYS: Final = ("engine", "clock", "version")
 
 
 def differences(scenarios: Sequence[str], summaries: Sequence[Summary]) -> list[list[str]]:
-    """Returns a row for each key that has not the same value in all effective scenarios (TOML), or in how the runs were made:
-    the key as `--set` takes it, then its value run by run."""
+    """Returns a row for each key whose value is not the same in all runs: the key, then its value in each run.
+
+    `scenarios` are the effective scenarios (TOML), `summaries` those of the same runs.  A key of a scenario is written as
+    `--set` takes it and as messages write it: `links.0.delay`.  `run: engine` and the like say how a run was made."""
     tables = [dict(_flat(tomllib.loads(scenario))) for scenario in scenarios]
     for table, summary in zip(tables, summaries, strict=True):
         table |= {f"run: {key}": str(getattr(summary.run, key)) for key in RUN_KEYS}
@@ -24,12 +26,13 @@ def differences(scenarios: Sequence[str], summaries: Sequence[Summary]) -> list[
 
 
 def _flat(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Yields keys with their values as TOML writes them; lists of tables are taken apart, others are values."""
+    """Yields keys with their values as TOML writes them; an array of tables gives keys for each entry, any other array is one
+    value."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
             yield from _flat(item, f"{key}.{name}" if key else name)
     elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
         for number, item in enumerate(value):
-            yield from _flat(item, f"{key}[{number}]")
+            yield from _flat(item, f"{key}.{number}")
     else:
         yield key, "{}" if value == {} else str(tomlkit.item(value).as_string())

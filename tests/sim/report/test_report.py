@@ -207,8 +207,8 @@ def test_a_comparison_says_what_differs_and_takes_nothing_of_the_first_run_for_a
     assert "9 robots · 4 nodes · 3 s, 1 s · trace" in both.text
     (rows,) = re.findall("What differs .* key left right (.*?) Compared", both.text)
     assert rows == (
-        'duration 3.0 1.0 avoidance.enabled false true claims[1].block "centroid" "inter" claims[2].block – "centroid" '
-        "claims[2].settled_by – 10.0 claims[2].band – 0.05"
+        'duration 3.0 1.0 avoidance.enabled false true claims.1.block "centroid" "inter" claims.2.block – "centroid" '
+        "claims.2.settled_by – 10.0 claims.2.band – 0.05"
     )
 
 

@@ -82,25 +82,31 @@ class ExportOptions:
         default=None,
         metadata=option("folder for Parquet files; needs pyarrow; no CSV then, unless --csv is given", "DIR"),
     )
+    replace: bool = field(default=False, metadata=option("overwrite tables that these folders hold already"))
     json: bool = field(default=False, metadata=JSON)
 
 
 def export(options: ExportOptions) -> int:
     """Writes a run's tables as CSV or Parquet."""
-    from echelon.sim.export import export_csv, export_parquet
+    from echelon.sim.export import export_csv, export_parquet, in_the_way
     from echelon.sim.run_folder import open_run
 
     run = open_run(options.run)
-    jobs = [("--parquet", export_parquet, options.parquet), ("--csv", export_csv, options.csv)]
-    if options.parquet is None and options.csv is None:
-        jobs = [("", export_csv, options.run / "csv")]
+    asked = [("--parquet ", export_parquet, options.parquet), ("--csv ", export_csv, options.csv)]
+    jobs = [(flag, write, folder) for flag, write, folder in asked if folder is not None]
+    jobs = jobs or [("", export_csv, options.run / "csv")]
+    if not options.replace:
+        for flag, write, folder in jobs:  # before the first file is written
+            if there := in_the_way(run, folder, "csv" if write is export_csv else "parquet"):
+                raise UsageError(
+                    f"{flag}{folder}: holds {', '.join(there)} already; give another folder, or --replace to overwrite"
+                )
     written: dict[str, list[str]] = {}
     for flag, write, folder in jobs:
-        if folder is not None:
-            try:
-                written[str(folder)] = [path.name for path in write(run, folder)]
-            except OSError as error:
-                raise UsageError(f"{flag} {folder}: {error.strerror}".strip()) from None
+        try:
+            written[str(folder)] = [path.name for path in write(run, folder)]
+        except OSError as error:
+            raise UsageError(f"{flag}{folder}: {error.strerror}") from None
     if options.json:
         print(json.dumps({"run": str(options.run), "files": written}))
     else:
@@ -194,10 +200,12 @@ A report.html that is no report is not overwritten.""",
 Writes what a run recorded as tables, CSV or Parquet: every state of every robot, and where the
 desired formation has it; the shape variables and the centroid with their errors; what became of
 the messages of each link; CAN frames, decoded; of a closed torque path what each wheel was
-asked for and did.  A notebook has the same tables: `run.tables`, `run.to_pandas()`.""",
+asked for and did.  A notebook has the same tables: `run.tables`, `run.to_pandas()`.  Tables
+that are there already are not overwritten unless --replace is given.""",
         examples={
             "echelon export runs/demo": "robots.csv and the others in runs/demo/csv",
             "echelon export runs/demo --csv tables": "in a folder of yours",
+            "echelon export runs/demo --csv tables --replace": "the same folder again",
         },
         codes={0: "written"},
     ),

@@ -249,6 +249,26 @@ def test_export_goes_into_the_runs_folder_and_says_so(folder: Path, tmp_path: Pa
     assert refused.stderr == f"echelon: --csv {run}/run.mcap: File exists\n"
 
 
+def test_export_overwrites_tables_only_where_it_is_told_to(folder: Path, tmp_path: Path) -> None:
+    run, tables = tmp_path / "run", tmp_path / "tables"
+    shutil.copytree(folder, run)
+    tables.mkdir()
+    (tables / "links.csv").write_text("mine")
+    says = "holds links.csv already; give another folder, or --replace to overwrite\n"
+    for arguments in (("--csv", tables), ("--parquet", tmp_path / "parquet", "--csv", tables)):
+        done = echelon("export", run, *arguments)
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"echelon: --csv {tables}: {says}")
+    assert [path.name for path in tables.iterdir()] == ["links.csv"]
+    assert (tables / "links.csv").read_text() == "mine"
+    assert not (tmp_path / "parquet").exists()
+    assert echelon("export", run, "--csv", tables, "--replace").returncode == 0
+    assert (tables / "links.csv").read_text().startswith("source,")
+    assert echelon("export", run).returncode == 0
+    again = echelon("export", run)  # the folder that is used unless one is given is no exception
+    assert (again.returncode, again.stdout) == (2, "")
+    assert again.stderr.startswith(f"echelon: {run}/csv: holds robots.csv, blocks.csv, ")
+
+
 def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "both.html"
     assert echelon("report", folder, folder, "--out", page).returncode == 0

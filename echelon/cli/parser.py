@@ -1,6 +1,6 @@
-"""The parser of the command line: which commands there are, where they are defined, and what their help says.
+"""The parser of the command line: the list of all commands, and the layout of their help.
 
-A family of commands is imported when one of them is typed, so that `--help` is there at once.
+The module that defines a command is imported only when that command was typed, so that `--help` answers at once.
 """
 
 import sys
@@ -27,7 +27,7 @@ FIRST_LOOK: Final = {
 CODES: Final = {0: "done, and the verdict holds", 1: "the verdict fails"}
 MISTAKES: Final = {2: "the input is wrong", 3: "it could not be done, or not to its end"}
 WIDTH: Final = 42
-"""Of an example, with two spaces behind it"""
+"""Width of the column of examples in the help [characters]; longer examples have a line of their own"""
 
 
 def _run() -> Commands:
@@ -61,13 +61,13 @@ def _machine() -> Commands:
 
 
 class Entry(NamedTuple):
-    """A command in the list of commands: what it does in a line, and what imports its family."""
+    """A command in the list of commands: its summary in one line, and the function that imports its definition."""
 
     summary: str
     family: Callable[[], Commands]
 
     def command(self, name: str) -> "Command[Any]":
-        """Returns the command itself."""
+        """Returns the definition of the command with this name, which the family must have."""
         return next(command for command in self.family() if command.name == name)
 
 
@@ -91,14 +91,16 @@ ENTRIES: Final = {
 
 
 class Call(NamedTuple):
-    """What was typed: the command with its options, ready to be called for its exit code."""
+    """A command with its options.  `work` runs it and returns the exit code; `debug` is the option `--debug`."""
 
     work: Callable[[], int]
     debug: bool
 
 
 def read(arguments: Sequence[str] | None = None) -> Call:
-    """Returns what was typed.  Ends the process, as argparse does, for --help and for mistakes."""
+    """Returns the command and options in these arguments, by default those of the process.
+
+    Ends the process for `--help` (exit code 0) and for wrong arguments (2), as argparse does."""
     words = sys.argv[1:] if arguments is None else arguments
     parsed = make_parser([name for name in ENTRIES if name in words]).parse_args(words)
     command: Command[Any] = parsed.command
@@ -107,12 +109,12 @@ def read(arguments: Sequence[str] | None = None) -> Call:
 
 
 def make_parser(names: Collection[str] = ENTRIES.keys()) -> ArgumentParser:
-    """Returns the parser of all commands; only those of these names have their options."""
+    """Returns the parser of all commands.  Only the commands with these names get their options and their help."""
     top = _Parser(
         prog="echelon", description=ABOUT, epilog=_epilog("a first look", FIRST_LOOK, CODES), formatter_class=_Help
     )
     top.add_argument("--version", action="version", version=f"echelon {__version__}")
-    debug = "show the traceback of an error that nobody expected, or in a part of yours"
+    debug = "show the traceback of an unexpected error, or of an error in a part of yours"
     top.add_argument("--debug", action="store_true", help=debug)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     for name, entry in ENTRIES.items():
@@ -127,7 +129,7 @@ def make_parser(names: Collection[str] = ENTRIES.keys()) -> ArgumentParser:
 
 
 class _Help(RawDescriptionHelpFormatter):
-    """Help with room for the names of commands in its left column."""
+    """Formats help with a left column that is wide enough for the names of all commands."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=28)
@@ -135,13 +137,14 @@ class _Help(RawDescriptionHelpFormatter):
 
 
 class _Parser(ArgumentParser):
-    """A parser that says a mistake in one line."""
+    """A parser that reports a mistake in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}\n")
 
 
 def _epilog(title: str, examples: Mapping[str, str], codes: Mapping[int, str]) -> str:
+    """Returns the end of a help text: examples with their purposes in a second column, and the exit codes."""
     lines = [f"{title}:"]
     for example, purpose in examples.items():
         lines += (

@@ -5,7 +5,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -92,6 +92,12 @@ class Child:
             return "gone"
         state = next((line for line in text.splitlines() if line.startswith("State:")), "State: ? (unknown)")
         return state.partition("(")[2].rstrip(")")
+
+
+def last_words_of(children: Sequence[Child]) -> str:
+    """Returns the ends of the standard error of several processes, each under a heading; "" if there is nothing."""
+    said = [f"\n--- last words of {child.name}:\n{words}" for child in children if (words := child.last_words())]
+    return "".join(said)
 
 
 def warm_up() -> None:

@@ -294,7 +294,7 @@ def test_figures_are_files_of_the_formats_that_are_asked_for(folder: Path, tmp_p
     names = {Path(path).name for path in facts["figures"]}
     assert {"compared-errors.svg", "short (1)-errors.svg", "short (2)-errors.svg"} <= names
     assert len(names) == 4 + 5 + 5
-    says = "echelon: --format pdf: is of the files of --figures DIR\n"
+    says = "echelon: --format pdf: needs --figures DIR, which writes the figures as files\n"
     assert echelon("report", folder, "--format", "pdf").stderr == says
 
 
@@ -302,7 +302,7 @@ def test_a_report_overwrites_reports_alone_unless_it_is_told_to(folder: Path, tm
     page = tmp_path / "report.html"
     page.write_text("<html>mine</html>")
     done = echelon("report", folder, folder, cwd=tmp_path)
-    says = "echelon: report.html: is there, and no report of echelon's; give another file with --out\n"
+    says = "echelon: report.html: exists, and echelon did not write it; give another file with --out\n"
     assert (done.returncode, done.stderr) == (2, says)
     assert page.read_text() == "<html>mine</html>"
     for arguments in (("--out", "report.html"), ()):

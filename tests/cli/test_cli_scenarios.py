@@ -75,7 +75,7 @@ def test_the_folder_of_a_run_stands_for_its_scenario(folder: Path, tmp_path: Pat
     assert json.loads(echelon("analyse", folder, "--json").stdout)["scenario"] == "lab"
     assert echelon("dbc", folder).stdout == (folder / "torque.dbc").read_text()
     drives = echelon("drives", folder, "--can", "none")
-    assert "drives without a bus to others" in drives.stderr
+    assert "drives need a bus that other processes can use" in drives.stderr
 
 
 def test_a_run_may_go_into_the_folder_that_it_comes_from(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from echelon.cli import main
-from echelon.cli.listening import show_growing
+from echelon.cli.showing import show_growing
 from echelon.sim.interruption import interruption
 from echelon.sim.run_folder import open_run
 from echelon.sim.run_state import goes_on, read_state

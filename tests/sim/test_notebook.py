@@ -128,7 +128,7 @@ def test_scenarios_come_from_names_files_tables_and_what_was_loaded(tmp_path: Pa
     [
         ("laab", {}, "laab: no such file, and no shipped scenario; those are "),
         ("lab", {"law.leed": 0.0}, "law.leed: unknown key; did you mean 'lead'?"),
-        ("lab", {"law.lead": None}, "None has no place in a scenario"),
+        ("lab", {"law.lead": None}, "None: must be a number, a string, a boolean"),
         ({"name": "t"}, {}, "scenario: duration: missing"),
         ("lab", {"can.virtual_drives": False, "can.path": "closed"}, "real drives need --clock wall"),
     ],

@@ -85,7 +85,7 @@ def test_what_was_killed_is_rebuilt_in_place(left: Path, tmp_path: Path) -> None
         assert echelon(command, folder).returncode == 0
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     again = echelon("recover", folder)
-    assert (again.returncode, again.stdout) == (0, f"{folder}: is whole, nothing was changed\n")
+    assert (again.returncode, again.stdout) == (0, f"{folder}: nothing is missing, nothing was changed\n")
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 
@@ -105,7 +105,7 @@ def test_files_that_are_missing_or_torn_are_made_anew(left: Path, tmp_path: Path
     done = echelon("recover", folder)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.endswith(
-        "written anew: run.mcap, run.mcap.cut, scenario.toml, torque.dbc, summary.json, report.html\n"
+        "written: run.mcap, run.mcap.cut, scenario.toml, torque.dbc, summary.json, report.html\n"
     )
     assert (folder / "scenario.toml").read_text() == scenario
     assert (folder / "can.log").read_bytes() == whole
@@ -123,11 +123,11 @@ def test_of_a_run_that_was_recorded_to_its_end_only_what_is_torn_is_mended(torn:
     assert done.returncode == 0
     after = summary_of(tmp_path)
     if torn == "run.mcap":
-        assert done.stdout.endswith("written anew: run.mcap, run.mcap.cut\n")
+        assert done.stdout.endswith("written: run.mcap, run.mcap.cut\n")
         assert after == before
         assert (tmp_path / "run.mcap").read_bytes().endswith(MAGIC)
     else:
-        assert done.stdout.endswith("written anew: summary.json, report.html\n")
+        assert done.stdout.endswith("written: summary.json, report.html\n")
         assert (after["trace_digest"], after["links"]) == (before["trace_digest"], before["links"])
         (reason,) = open_run(tmp_path).summary.verdict.reasons
         assert reason.startswith("whole: broken off before its summary was written")

@@ -166,4 +166,4 @@ def test_whether_a_period_is_realistic() -> None:
     assert (slow.state, len(slow.advice)) == ("note", 1)
     assert "--clock virtual" in slow.advice[0]
     jittery = doctor.check_wall_clock(plan, Measured(0.02, 0.00003))
-    assert jittery.advice == ("woken up to 20 ms late: periods over 40 ms",)
+    assert jittery.advice == ("processes wake up to 20 ms late: use periods over 40 ms",)

@@ -91,12 +91,13 @@ class Supervisor:
                 self._children.append(start(spec))
             self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
             startup_s = time.monotonic() - begun_s
-            start_s = time.monotonic() + (0.0 if self.virtual else self._lead_in_s())
+            lead_in_s = 0.0 if self.virtual else self._lead_in_s()
+            start_s = time.monotonic() + lead_in_s
             self._tell_all(Start(round(start_s * 1e9)))
             self.progress.phase, self.progress.started_s = "running", start_s
             self._stalls.begin(time.monotonic())
             members = [child for child in self._children if child.is_member]
-            limit_s = None if self.virtual else self.plan.duration_ns / 1e9 + WALL_OVERTIME_S
+            limit_s = None if self.virtual else lead_in_s + self.plan.duration_ns / 1e9 + WALL_OVERTIME_S
             self._until(lambda: all(child.done for child in members), limit_s, "not done")
             wall_s = time.monotonic() - start_s
             self.progress.phase = "finishing"

@@ -1,4 +1,4 @@
-"""The command line as a user types it: what it leaves, what it says, how it ends."""
+"""Commands as a user types them: the files they write, their output, their exit codes."""
 
 import csv
 import json
@@ -167,7 +167,14 @@ def test_no_room_for_the_first_file_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_bus_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
-    options = ("--can", "socketcan:lo", "--quiet", "--json", "--out", tmp_path)  # an interface, but none of CAN
+    options = (
+        "--can",
+        "socketcan:lo",
+        "--quiet",
+        "--json",
+        "--out",
+        tmp_path,
+    )  # lo is not a CAN interface
     done = echelon("run", "paper", *QUICK, *options)
     assert done.returncode == 3
     assert len(done.stderr.splitlines()) == 1
@@ -264,7 +271,7 @@ def test_export_overwrites_tables_only_where_it_is_told_to(folder: Path, tmp_pat
     assert echelon("export", run, "--csv", tables, "--replace").returncode == 0
     assert (tables / "links.csv").read_text().startswith("source,")
     assert echelon("export", run).returncode == 0
-    again = echelon("export", run)  # the folder that is used unless one is given is no exception
+    again = echelon("export", run)  # the same holds for the default folder
     assert (again.returncode, again.stdout) == (2, "")
     assert again.stderr.startswith(f"echelon: {run}/csv: holds robots.csv, blocks.csv, ")
 

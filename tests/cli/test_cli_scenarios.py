@@ -1,4 +1,4 @@
-"""Commands about scenarios: where they come from, which are shipped, how one begins, what their keys are."""
+"""Commands about scenarios: sources of scenarios, shipped scenarios, new scenarios, the schema of their keys, DBCs."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# Where scenarios come from
+# Sources of scenarios
 
 
 def test_a_scenario_comes_from_standard_input() -> None:
@@ -105,7 +105,7 @@ def test_all_mistakes_are_told_and_it_is_exit_code_2(tmp_path: Path) -> None:
     ]
 
 
-# Which are shipped
+# Shipped scenarios
 
 
 def test_scenarios_are_listed_with_what_they_show() -> None:
@@ -118,11 +118,11 @@ def test_scenarios_are_listed_with_what_they_show() -> None:
     assert all(line.endswith(row["description"]) for line, row in zip(lines, rows, strict=True))
 
 
-# A scenario to begin with
+# New scenarios
 
 
 def verdict(text: str) -> dict[str, Any]:
-    """Returns the summary of a scenario that is run in this process."""
+    """Runs a scenario in this process; returns its summary."""
     _, plan = parse(text, "t.toml")
     builder = TraceBuilder(plan)
     engine = Engine(plan, builder.add)
@@ -179,11 +179,11 @@ def test_what_is_new_runs_as_processes(tmp_path: Path) -> None:
     assert (summary["can"]["referee"]["kinds"], summary["verdict"]["word"]) == ({}, "HOLDS")
 
 
-# What their keys are
+# Schema of the keys
 
 
 def tables(schema: dict[str, Any]) -> dict[str, Any]:
-    """Returns the tables of a schema."""
+    """Returns the schemas of all tables in a schema, by their names."""
     return {"Scenario": schema, **schema["$defs"]}
 
 

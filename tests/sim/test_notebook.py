@@ -1,4 +1,4 @@
-"""What a notebook calls: the same runs as the command, as arrays with names; and steps in between."""
+"""Functions for notebooks: they give the same runs as the command, as named arrays; and a simulation can be stepped."""
 
 import json
 import subprocess
@@ -73,7 +73,7 @@ def test_what_is_not_there_is_named(lab: echelon.Run) -> None:
 
 
 def test_the_summary_is_in_the_attributes(lab: echelon.Run) -> None:
-    assert (lab.verdict.word, lab.holds, lab.ok) == ("HEALTHY", False, True)  # it claims nothing
+    assert (lab.verdict.word, lab.holds, lab.ok) == ("HEALTHY", False, True)  # the scenario has no claims
     assert lab.failure is None
     assert (lab.scenario, lab.duration, lab.claims) == ("lab", 0.5, ())
     assert lab.distance.smallest > 0
@@ -162,8 +162,8 @@ def test_steps_are_the_run(path: str) -> None:
 
 @pytest.mark.parametrize("path", ["mirror", "closed"])
 def test_overwritten_commands_are_what_a_robot_does(path: str) -> None:
-    """A robot at rest that is told to accelerate along its heading does so, whatever its leader wants; others do not move for
-    that in this period."""
+    """A robot at rest follows an acceleration along its heading that replaces its leader's command.  In this period the other
+    robots move as without it."""
     changes = {"duration": 0.2, "claims": [], "can.path": path, "robot.torque_rate_limit": float("inf")}
     meddled, left = echelon.Simulation("lab", changes), echelon.Simulation("lab", changes)
     meddled.commands[0] = 0.2, 0.0
@@ -192,7 +192,7 @@ def test_errors_and_states_are_those_of_the_instant() -> None:
     assert simulation.states["theta"][3] == run.robots["g2/r4"]["theta"][10]
 
 
-# Other ways in
+# Scripts, the example notebook, and mistakes
 
 
 @pytest.mark.parametrize("way", ["file", "standard input"])

@@ -1,4 +1,4 @@
-"""Folders that runs write into: what earlier runs left goes, what is not of a run stays as it is."""
+"""Folders that runs write into: files of earlier runs are deleted, all other files stay."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def left(lab: Path, tmp_path: Path) -> Path:
-    """What a run left."""
+    """A folder with a finished run."""
     return Path(shutil.copytree(lab, tmp_path / "run"))
 
 
@@ -60,7 +60,7 @@ def test_the_run_of_another_scenario_stays_unless_the_user_says_so(left: Path) -
 @pytest.mark.parametrize("name", run_files(plan_of("drives"), bus=True))
 def test_a_file_in_the_way_stays_as_it_is(name: str, replace: bool, tmp_path: Path) -> None:
     (tmp_path / name).write_text("mine")
-    with pytest.raises(UsageError, match=f"{name} is there"), out_folder("drives", tmp_path, [name], replace):
+    with pytest.raises(UsageError, match=f"{name} exists"), out_folder("drives", tmp_path, [name], replace):
         pass
     assert files(tmp_path) == {name: b"mine"}
 
@@ -74,7 +74,7 @@ def test_a_scenario_in_the_way_is_one_line(tmp_path: Path) -> None:
 
 def test_a_link_in_the_way_is_a_file_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "can.log").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match=r"can\.log is there"), out_folder("lab", tmp_path, ["can.log"]):
+    with pytest.raises(UsageError, match=r"can\.log exists"), out_folder("lab", tmp_path, ["can.log"]):
         pass
 
 

@@ -1,4 +1,4 @@
-"""Runs that are killed with all their processes: their folders are rebuilt as far as anything was recorded."""
+"""Folders of runs that were killed with all their processes are rebuilt from what was recorded."""
 
 import json
 import os
@@ -19,11 +19,11 @@ from echelon.sim.run_folder import open_run
 from support.runs import SCENARIOS, echelon, kill_session, plan_of, session_members, start_echelon, summary_of, until
 
 ENOUGH = 300_000
-"""Bytes of a recording that hold a good many states"""
+"""Size of a recording that holds many states [bytes]"""
 
 
 def killed(folder: Path, *arguments: str) -> Path:
-    """Starts a run that would take long, and kills all its processes at once while it is recording."""
+    """Starts a long run, and kills all its processes at the same time while it is recording."""
     command = start_echelon("run", *arguments, "--quiet", "--out", folder)
     recording = folder / "run.mcap"
     try:
@@ -43,7 +43,7 @@ def killed(folder: Path, *arguments: str) -> Path:
 
 @pytest.fixture(scope="module", params=["processes", "inprocess"])
 def left(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a killed run left."""
+    """The folder of a killed run."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
     return killed(folder, "lab", "--engine", request.param, "--set", "duration=3000.0")
 
@@ -99,8 +99,8 @@ def test_files_that_are_missing_or_torn_are_made_anew(left: Path, tmp_path: Path
     whole = log[: log.rindex(b"\n") + 1]
     (folder / "can.log").write_bytes(
         whole + whole.splitlines()[-1][:-6]
-    )  # half a frame, which looks like a shorter one
-    os.replace(folder / "run.mcap", folder / "run.mcap.cut")  # as if killed while it was mended
+    )  # half a frame, which looks like a frame with less data
+    os.replace(folder / "run.mcap", folder / "run.mcap.cut")  # as if an earlier recovery had been killed
     (folder / "summary.json").write_text("{")
     done = echelon("recover", folder)
     assert (done.returncode, done.stderr) == (0, "")

@@ -106,7 +106,7 @@ def test_small_socket_buffers(most: int, state: str, tmp_path: Path) -> None:
     (tmp_path / "rmem_default").write_text("212992\n")
     result = doctor.check_buffers(tmp_path)
     assert result.state == state
-    assert f"{most // 1024} KiB, candump has 208 KiB" in result.text
+    assert f"{most // 1024} KiB for receiving; candump uses 208 KiB" in result.text
     assert doctor.check_buffers(tmp_path / "nowhere").state == "note"
 
 

@@ -80,7 +80,9 @@ def test_drives_may_be_brought_up_for_longer_than_members_may_be_late(
 ) -> None:
     monkeypatch.setattr("echelon.sim.processes.supervisor.WALL_OVERTIME_S", 5.0)
     plan = plan_of("lab", "can.path=closed", "duration=0.2", "can.bring_up=7.0")
-    outcome = Supervisor(plan, tmp_path, run=f"test-{os.getpid()}", virtual=False, can_urls=(resolve_url("auto"),)).run()
+    outcome = Supervisor(
+        plan, tmp_path, run=f"test-{os.getpid()}", virtual=False, can_urls=(resolve_url("auto"),)
+    ).run()
     assert outcome.failure is None
 
 

@@ -249,7 +249,7 @@ def test_a_bus_that_is_alive(protocol: str, tmp_path: Path, capsys: pytest.Captu
         assert robot.enabled.wait(20.0)
         assert main(["can", str(path), "--can", url, "--seconds", "2.2", "--json"]) == 0
         shots = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        # processes wait for their turn here
+        # a busy machine delays processes, hence the tolerance
         code = main(["referee", str(path), "--can", url, "--seconds", "1", "--json", "--tolerance", "2"])
         summary = json.loads(capsys.readouterr().out)
     assert len(shots) >= 2

@@ -168,9 +168,11 @@ def list_specs(
 
     process        who connects to it
     node           its children
-    recorder       all members and the bridge
+    recorder       all other processes except the referee
     bridge         robots
     drives         robots and the bridge
+
+    Real drives have no process.  The referee connects to no process; it listens to the buses.
     """
     stations = [role.name for role in plan.bus_roles]
     if can_urls and not plan.can.closed:

@@ -33,7 +33,7 @@ class Command(Generic[Options]):
     examples: Mapping[str, str]
     """Command lines that can be typed as they are, each with its purpose"""
     codes: Mapping[int, str]
-    """Meanings of the exit codes 0 and 1; 2 and 3 mean the same for all commands"""
+    """Meanings of the exit codes 0 and 1; also of 2 or 3 if there is more to say than for all commands"""
 
     def add_options(self, parser: ArgumentParser) -> None:
         """Adds the arguments for all options to a parser."""

@@ -26,6 +26,7 @@ FIRST_LOOK: Final = {
 }
 CODES: Final = {0: "done, and the verdict holds", 1: "the verdict fails"}
 MISTAKES: Final = {2: "the input is wrong", 3: "it could not be done, or not to its end"}
+"""Exit codes that mean the same for all commands, unless a command says more about one of them"""
 WIDTH: Final = 42
 """Width of the column of examples in the help [characters]; longer examples have a line of their own"""
 
@@ -150,5 +151,6 @@ def _epilog(title: str, examples: Mapping[str, str], codes: Mapping[int, str]) -
         lines += (
             [f"  {example:<{WIDTH}}{purpose}"] if len(example) < WIDTH else [f"  {example}", f"  {'':{WIDTH}}{purpose}"]
         )
-    lines += ["", "exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in {**codes, **MISTAKES}.items())]
+    meanings = sorted({**MISTAKES, **codes}.items())
+    lines += ["", "exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in meanings)]
     return "\n".join(lines)

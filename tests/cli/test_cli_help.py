@@ -67,7 +67,9 @@ def test_the_help_of_a_command_says_what_it_does_with_examples_and_exit_codes(na
     assert command.about in done.stdout
     assert 2 <= len(command.examples) <= 5
     assert all(f"  {example}" in done.stdout for example in command.examples)
-    assert done.stdout.splitlines()[-1].startswith("exit codes: 0 ")
+    last = done.stdout.splitlines()[-1]
+    assert last.startswith("exit codes: 0 ")
+    assert all(f" {code} {meaning}" in last for code, meaning in command.codes.items())
     assert max(map(len, command.about.splitlines())) <= 100
 
 

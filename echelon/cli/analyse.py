@@ -34,7 +34,7 @@ def analyse(options: AnalyseOptions) -> int:
     try:
         found = analysis_of(plan)
     except PredictionError as error:
-        raise UsageError(f"{options.scenario}: cannot be analysed, only run: {error}") from None
+        raise UsageError(f"{options.scenario}: cannot be analysed; run it instead: {error}") from None
     asked = asked_of(plan)
     diverges, warnings = torque_loop_diverges(plan, asked), torque_loop_warnings(plan, asked)
     if options.json:
@@ -73,11 +73,9 @@ def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: boo
         for channel, delays in found.delays.items()
         if any(d > 0 for d in delays)
     ]
+    lines.append(f"  delays of the scenario's links: {', '.join(late) if late else 'none'}; no link loses messages")
     lines.append(
-        f"  delays of the scenario's links: {', '.join(late) if late else 'none'}; none of them loses anything"
-    )
-    lines.append(
-        "  taken for granted: torque does what acceleration asks, no limit acts, avoidance is silent"
+        "  assumed: robots follow the desired accelerations exactly, no limit acts, avoidance does not act"
         + (", bus and drives take no time" if closed else "")
     )
     for block in found.blocks:
@@ -93,8 +91,8 @@ def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: boo
         return lines
     if found.centroid_age > 0:
         lines.append(
-            f"  positions are {1e3 * found.centroid_age:.4g} ms old at the coordinator: while the formation moves, its "
-            "centroid is off by what it moves in that time"
+            f"  positions are {1e3 * found.centroid_age:.4g} ms old at the coordinator: the centroid of a moving formation is "
+            "off its trajectory by the distance that it moves in this time"
         )
     beyond = "beyond these delays, " if late else ""
     lines.append(f"  {beyond}all messages of one channel may be later by up to")
@@ -108,8 +106,8 @@ def _later(found: "LargestDelay") -> str:
     assert found.seconds is not None
     why = {
         "unstable": "one tick more does not settle",
-        "timeout": "one tick more is older than the timeout allows, and is not used at all",
-        "limit": "more has not been tried",
+        "timeout": "with one tick more they are older than the timeout allows, and not used at all",
+        "limit": "longer delays have not been tried",
     }
     return f"{1e3 * found.seconds:.6g} ms ({found.ticks} ticks of {1e3 * found.tick_s:g} ms); {why[found.ends]}"
 

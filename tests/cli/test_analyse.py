@@ -50,7 +50,7 @@ def test_the_first_line_says_of_which_channels_and_periods_it_speaks() -> None:
     assert first == (
         "multi: channels state, group_state, reference and command; accelerations every 2 ms, torques every 1 ms"
     )
-    assert rest[0] == "  delays of the scenario's links: none; none of them loses anything"
+    assert rest[0] == "  delays of the scenario's links: none; no link loses messages"
 
 
 def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_milliseconds() -> None:
@@ -119,7 +119,7 @@ def test_links_that_are_not_treated_are_named_and_no_margin_is_printed(rule: str
     assert (done.returncode, done.stdout) == (2, "")
     assert (
         done.stderr
-        == f"echelon: lab: cannot be analysed, only run: {named}: only constant delays without loss are treated\n"
+        == f"echelon: lab: cannot be analysed; run it instead: {named}: only constant delays without loss are treated\n"
     )
 
 

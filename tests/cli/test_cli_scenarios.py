@@ -165,7 +165,7 @@ def test_new_writes_a_file_and_replaces_none(tmp_path: Path) -> None:
     (tmp_path / "my.toml").write_text("mine")
     again = echelon("new", "my", cwd=tmp_path)
     assert again.returncode == 2
-    assert again.stderr == "echelon: my.toml: is there already; --force replaces it\n"
+    assert again.stderr == "echelon: my.toml: exists already; --force overwrites it\n"
     assert (tmp_path / "my.toml").read_text() == "mine"
     assert echelon("new", "my", "--force", cwd=tmp_path).returncode == 0
     assert (tmp_path / "my.toml").read_text() == scenario_text("my", (3, 3), None)

@@ -1,7 +1,6 @@
-"""Keys that every robot needs and that a scenario gives on no level: not to the robot, not to its groups, not in `[robot]`.
+"""Finds the keys that a robot needs but gets from no table: not from its own, its groups' or `[robot]`.
 
-They are looked for in the tables of the file, before pydantic reads them, so that they are reported together with all other
-mistakes.
+They are found in the tables as they were read, before validation, so that they are reported together with all other mistakes.
 """
 
 from collections.abc import Iterator
@@ -11,17 +10,17 @@ from echelon.planning.explain import close_key, key_text
 from echelon.scenario.tables import RobotTable
 
 STAND_INS: Final = {"mass": 1e-300, "inertia": 1e300, "wheel_radius": 1.0, "arm": 1.0, "offset": 1e-9}
-"""Allowed values for the keys that every robot needs, except `start`.  With any of them, a robot's inertia is large enough."""
+"""Values that stand in for missing keys, except `start`.  They are allowed together with any values of the other keys."""
 APART: Final = 1e9
-"""Distance between stand-ins for `start` [m]: such robots are nowhere near others"""
+"""Distance between the stand-ins for `start` of two robots [m]; they are far from all other robots, too"""
 
 
 def fill_missing(table: dict[str, Any]) -> list[tuple[str, str]]:
-    """Gives robots stand-ins for the keys that they lack; returns the mistakes: pairs of the key and the line for the user.
+    """Returns the mistakes about missing keys of robots, as pairs of the key and the line for the user.
 
-    `table` is a whole scenario, as it was read; the stand-ins are put into it.  So the remaining mistakes can be found, but the
-    result must not be run if there were any.  A key that several robots lack is reported for the first of them.  Tables that
-    are no tables, and keys that an unknown key resembles, are left to pydantic."""
+    `table` is a whole scenario as it was read.  Stand-ins for the missing keys are put into it, so that validation can find
+    the remaining mistakes; a plan made with stand-ins must not be used.  A key that several robots lack is reported for the
+    first of them.  A misspelled key, or a value where a table should be, is reported by validation and not here."""
     lacking: dict[str, list[str]] = {}
     formation, shared = table.get("formation"), table.get("robot", {})
     if isinstance(formation, dict) and isinstance(shared, dict):

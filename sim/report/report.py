@@ -42,9 +42,10 @@ from echelon.sim.report.page import (
 from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.block_series import Blocks, block_series
 from echelon.sim.results.distances import Distances, distances
-from echelon.sim.results.records import DistanceResult, Summary, count
+from echelon.sim.results.records import DistanceResult, Summary
 from echelon.sim.results.summary import number
 from echelon.sim.results.trace import Trace
+from echelon.sim.results.verdict import count
 
 PAPER: Final = "paper"
 """The name of the scenario whose figures the paper has"""

@@ -22,9 +22,9 @@ from echelon.bridge.reports import (
 from echelon.planning.loading import effective_toml
 from echelon.sim.report.drawing import COLUMNS, thin
 from echelon.sim.report.report import RunForReport, write_report
-from echelon.sim.results.records import count
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+from echelon.sim.results.verdict import count
 from support.synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
 
 FIGURES, COMPARED = 5, 4

@@ -12,9 +12,10 @@ from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.scenario.tables import CheckName
 from echelon.sim.results.checks import CHECKS
-from echelon.sim.results.records import CheckResult, Summary
+from echelon.sim.results.records import Summary
 from echelon.sim.results.summary import summarise, summary_text
 from echelon.sim.results.trace import Trace
+from echelon.sim.results.verdict import CheckResult
 from support.runs import plan_of
 from support.synthetic import FIELD, can_report, of_errors, run_facts, with_states
 
@@ -116,7 +117,7 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
         "not tested": (lambda: judged(decaying(0.1, "duration=2.0")), "a third of the run is shorter than the dwell time"),
     },
     "end": {
-        "passed": (lambda: judged(decaying()), "no block ends above where it began"),
+        "passed": (lambda: judged(decaying()), "no block ends with a larger error than at the start"),
         "not tested": (lambda: judged(decaying(0.1, "duration=2.0")), "a third of the run is shorter than the dwell time"),
     },
     "distance": {
@@ -126,7 +127,7 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
     "avoidance": {
         "passed": (lambda: judged(met(0.5, "avoidance.enabled=true")), "no two robots came closer than 0."),
         "failed": (lambda: judged(met(0.1, "avoidance.enabled=true")), "g1/r1 and g1/r2 came to 0.1 m"),
-        "not tested": (lambda: judged(decaying(0.1)), "nobody came within"),
+        "not tested": (lambda: judged(decaying(0.1)), "no two robots came within"),
     },
     "saturation": {
         "passed": (lambda: judged(states(decaying(0.1, LIMIT), "saturated", 1.0, 0, slice(1, 301))), "for 15 % of the time"),
@@ -137,16 +138,16 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
         ),
     },
     "messages": {
-        "passed": (lambda: judged(decaying()), "something came and was used"),
+        "passed": (lambda: judged(decaying()), "messages were used on each of"),
         "failed": (
             lambda: judged(t := decaying(), links=counted(t.plan, delivered=0, lost=10, **UNUSED)),
-            "nothing ever arrived over 1 of",
+            "no message arrived on 1 of",
         ),
-        "not tested": (lambda: judged(decaying(), links=[]), "nobody counted the messages"),
+        "not tested": (lambda: judged(decaying(), links=[]), "the messages of the links were not counted"),
     },
     "silence": {
-        "passed": (lambda: judged(without(decaying(0.1, NO_RECORDING), 3, slice(100, 149))), "g2/r4 said nothing for 0.5 s"),
-        "failed": (lambda: judged(without(decaying(), 3, slice(100, 150))), "g2/r4 said nothing for 0.51 s"),
+        "passed": (lambda: judged(without(decaying(0.1, NO_RECORDING), 3, slice(100, 149))), "g2/r4 sent no state for 0.5 s"),
+        "failed": (lambda: judged(without(decaying(), 3, slice(100, 150))), "g2/r4 sent no state for 0.51 s"),
     },
     "refused": {
         "passed": (lambda: judged(decaying()), "no message was refused"),
@@ -248,7 +249,7 @@ def test_what_is_missing_has_its_robot_its_time_and_on_a_busy_machine_the_likely
     for facts, cause in (({}, ""), (busy, "; 4.5 % of stages were late: was the machine busy?")):
         summary = judged(trace, run=run_facts(**facts))
         silent, lacking = only(summary, "silence").text, only(summary, "recording").text
-        assert silent == f"g2/r4 said nothing for 0.61 s from t = 0.99 s on, the longest of all robots{cause}"
+        assert silent == f"g2/r4 sent no state for 0.61 s from t = 0.99 s on, the longest of all robots{cause}"
         whose = "1 of g1/r2 after t = 4.99 s, 60 of g2/r4 after t = 0.99 s"
         assert lacking == f"the recording lacks 61 states ({whose}){cause}"
     assert "busy" not in only(judged(decaying(), run=run_facts(**busy)), "silence").text
@@ -264,7 +265,7 @@ def test_a_message_that_came_but_was_never_used_is_told_from_one_that_never_came
     trace = decaying()
     summary = judged(trace, links=counted(trace.plan, **UNUSED))
     assert only(summary, "messages").text.startswith(
-        "nothing that arrived was ever used, as too old or empty, over 1 of"
+        "messages arrived, but none was used, as too old or empty, on 1 of"
     )
     assert summary.links[0].age_mean is None
     assert summary.links[0].age_max is None
@@ -274,7 +275,7 @@ def test_where_nothing_was_ever_used_no_age_is_told():
     trace = decaying()
     none = [replace(one, delivered=0, lost=10, used=0) for one in counted(trace.plan)]
     assert "10 lost, oldest" not in (text := summary_text(judged(trace, links=none)))
-    assert "nothing was ever used" in text
+    assert "no message was used" in text
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,7 @@ def test_a_run_of_three_dwell_times_is_long_enough_to_tell(duration, kind):
     ending = ended_as(lambda t: 0.5 * np.exp(-0.3 * t), duration)
     assert ending.kind == kind
     if kind == "too short":
-        assert ending.text == "cannot be judged, for a third of the run is shorter than 3 s, its dwell time"
+        assert ending.text == "cannot be judged: a third of the run is shorter than its dwell time, 3 s"
 
 
 def test_the_bound_of_growth_is_the_scenarios():

@@ -152,7 +152,7 @@ def test_nothing_claimed_is_no_claim_that_holds():
     record = record_of(decaying([NO_CLAIMS]).trace)
     assert record.verdict.word == "HEALTHY"
     assert record.verdict.sentence.startswith("HEALTHY: nothing was claimed; ")
-    assert "not tested: messages: nobody counted" in str(record.verdict)
+    assert "not tested: messages: the messages of the links were not counted" in str(record.verdict)
 
 
 def passing(offset: float, speed: float, steps: int, period_ns: int = 100 * MS) -> Trace:

@@ -199,12 +199,24 @@ class RefereeReport:
     source: str = "can.log"
     """Where the frames came from: `can.log`, or `bus` if the referee listened itself"""
     until: float | None = None
-    """Only frames up to then were judged, for the run was stopped there [s]; None: all frames"""
+    """When the run was stopped, if it was [s]: only frames up to then are judged; None: all frames are"""
+    later: int = 0
+    """Frames in can.log after `until`, which are not judged: the processes of a run end one after the other"""
 
     @property
     def up_to(self) -> str:
-        """Up to when frames were judged, in words that follow their number; empty if all were."""
+        """Up to when frames are judged, in words that follow their number; empty if all are."""
         return "" if self.until is None else f" up to {self.until:g} s, where the run was stopped"
+
+    @property
+    def after_stop(self) -> str:
+        """A sentence about the frames after the stop, without a capital or a full stop; empty if there are none."""
+        if self.until is None or not self.later:
+            return ""
+        return (
+            f"the run was stopped at {self.until:g} s; can.log and the numbers of the buses include {self.later} later frames, "
+            "which are not judged"
+        )
 
 
 @dataclass(frozen=True, slots=True)

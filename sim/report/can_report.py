@@ -19,6 +19,8 @@ def can_section(can: CanReport | None, frames: Sequence[Mapping[str, object]]) -
     if can is None or not can.frames:
         return paragraph("No bus in this run.")
     text = paragraph(" ".join(_sentences(can)))
+    if can.referee is not None and can.referee.after_stop:
+        text += paragraph(f"{can.referee.after_stop}.".capitalize())
     text += "".join(paragraph(f"{line}.") for line in can.fit)
     text += table(["", ""], [[key.replace("_", " "), _plain(getattr(can, key))] for key in SIMPLE], numeric_from=2)
     if can.advice:
@@ -54,7 +56,7 @@ def _sentences(can: CanReport) -> list[str]:
 
 def _referee(referee: RefereeReport) -> str:
     found = ", ".join(f"{count} {kind}" for kind, count in referee.kinds.items()) or "nothing wrong"
-    words = subheading("Referee") + paragraph(f"It looked at {referee.frames} frames{referee.up_to} and found {found}.")
+    words = subheading("Referee") + paragraph(f"Frames{referee.up_to}: {referee.frames}. Found: {found}.")
     rows = [[f"{row.time:.6g}", row.bus, row.id, row.robot, row.kind, row.text] for row in referee.findings[:MAX_ROWS]]
     if not rows:
         return words

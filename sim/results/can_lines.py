@@ -40,6 +40,8 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
     if can.referee is not None:
         found = ", ".join(f"{number} {kind}" for kind, number in can.referee.kinds.items()) or "nothing wrong"
         yield f"  referee  {can.referee.frames} frames{can.referee.up_to}: {found}"
+        if can.referee.after_stop:
+            yield f"  stop     {can.referee.after_stop}"
 
 
 def finding_text(referee: RefereeReport) -> str:

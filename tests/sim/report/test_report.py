@@ -167,7 +167,9 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
         buses=(BusReport("can0", 500_000, 0.25, events=events, identifiers=identifiers),),
         robots={"g1/r1": WheelsReport("odrive", 5, {"rise limit": 3}, 1.5, enabled=False, fault="right: hot")},
         drives=DrivesReport({"g1/r1": DriveReport({}, 0, 71.25)}, {}),
-        referee=RefereeReport(11, 0, {"gap": 1}, (FindingReport(1.5, "can0", "100", "gap", "<late>", "g1/r1"),), {}),
+        referee=RefereeReport(
+            11, 0, {"gap": 1}, (FindingReport(1.5, "can0", "100", "gap", "<late>", "g1/r1"),), {}, until=3.5, later=4
+        ),
     )
     one = for_report(run, "bus")
     text = rendered([replace(one, summary=replace(one.summary, can=can))], tmp_path / "report.html").text
@@ -175,7 +177,8 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
     assert "became zero before the bus: 3 times rise limit" in text
     assert "100 5 1 2 1 2 3 101 5 1 2 1 2 –" in text
     assert "g1/r1 odrive 5 1.5 0 0 0 0 False right: hot 3 rise limit 71.25" in text
-    assert "11 frames and found 1 gap" in text
+    assert "Frames up to 3.5 s, where the run was stopped: 11. Found: 1 gap." in text
+    assert "The run was stopped at 3.5 s; can.log and the numbers of the buses include 4 later frames" in text
     assert "1.5 can0 100 g1/r1 gap <late>" in text
     assert "2 scheduled g1/r1, g1/r2 estop, until 4 s 2.5 can0 g1/r1 bus-off" in text
 

@@ -1,4 +1,4 @@
-"""What differs between the scenarios of several runs, and how they were run."""
+"""The table of differences between several runs: keys of their scenarios, and how they were run."""
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,12 +9,16 @@ import tomlkit
 from echelon.sim.results.records import Summary
 
 ABSENT: Final = "–"
+"""Shown for a key that a scenario does not have"""
 RUN_KEYS: Final = ("engine", "clock", "version")
+"""Fields of `RunFacts` that are compared"""
 
 
 def differences(scenarios: Sequence[str], summaries: Sequence[Summary]) -> list[list[str]]:
-    """Returns a row for each key that has not the same value in all effective scenarios (TOML), or in how the runs were made:
-    the key as `--set` takes it, then its value run by run."""
+    """Returns a row for each key whose value is not the same in all runs: the key, then its value in each run.
+
+    `scenarios` are the effective scenarios as TOML; their keys are written as `--set` takes them.  The fields `RUN_KEYS` of the
+    summaries follow, as `run: engine` and so on."""
     tables = [dict(_flat(tomllib.loads(scenario))) for scenario in scenarios]
     for table, summary in zip(tables, summaries, strict=True):
         table |= {f"run: {key}": str(getattr(summary.run, key)) for key in RUN_KEYS}
@@ -24,7 +28,7 @@ def differences(scenarios: Sequence[str], summaries: Sequence[Summary]) -> list[
 
 
 def _flat(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Yields keys with their values as TOML writes them; lists of tables are taken apart, others are values."""
+    """Yields keys with their values as TOML.  A list of tables is taken apart, `key[0].name`; any other list is a value."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
             yield from _flat(item, f"{key}.{name}" if key else name)

@@ -21,7 +21,8 @@ from echelon.bridge.reports import (
 )
 from echelon.planning.loading import effective_toml
 from echelon.sim.report.drawing import COLUMNS, thin
-from echelon.sim.report.report import RunForReport, write_report
+from echelon.sim.report.report import write_report
+from echelon.sim.report.run_for_report import RunForReport
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
 from echelon.sim.results.verdict import count
@@ -268,6 +269,14 @@ def test_runs_that_went_wrong_are_drawn_as_far_as_they_go(run, tmp_path):
     page = rendered(shown, tmp_path / "report.html")
     assert page.tags.count("svg") == 4 * FIGURES + COMPARED
     assert page.text.count("FAILS —") == 4
+
+
+def test_a_link_over_which_nothing_was_used_has_no_ages(run, tmp_path):
+    one = for_report(run, "run")
+    unused = replace(one.summary.links[0], used=0, age_mean=None, age_max=None)
+    page = rendered([replace(one, summary=replace(one.summary, links=(unused,)))], tmp_path / "report.html")
+    counts = f"{unused.sent} {unused.lost} {unused.in_flight} {unused.held}"
+    assert f"{unused.source} → {unused.receiver} {unused.channel} {counts} – –" in page.text
 
 
 def test_a_report_needs_a_run(tmp_path):

@@ -367,5 +367,6 @@ def test_frames_after_the_stop_of_a_run_are_told_where_there_are_some(until, lat
     referee = RefereeReport(4, 0, {}, (), {}, until=until, later=later)
     *_, last = can_lines(can_report(frames=7, referee=referee))
     up_to = "" if until is None else " up to 0.5 s, where the run was stopped"
-    told = "  stop     the run was stopped at 0.5 s; can.log and the numbers of the buses include 3 later frames, which are not judged"
-    assert last == (told if later else f"  referee  4 frames{up_to}: nothing wrong")
+    told = "can.log and the numbers of the buses include 3 later frames, which are not judged"
+    judged = f"  referee  4 frames{up_to}: nothing wrong"
+    assert last == (f"  stop     the run was stopped at 0.5 s; {told}" if later else judged)

@@ -140,7 +140,7 @@ def test_the_caption_of_distances_says_what_the_table_below_says(radius, tmp_pat
     text = rendered([one], tmp_path / "report.html").text
     said = {
         True: f"not enabled: {count(len(pairs), 'pair')} came closer than 6 m.",
-        False: "robots keep out of it by chance.",
+        False: "robots keep this distance by chance.",
     }
     assert [words in text for words in said.values()] == [bool(pairs), not pairs]
 

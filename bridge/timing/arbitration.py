@@ -18,9 +18,9 @@ bus-off         TEC is over 255, or `bus_off` was called        does not send or
                                                                 `restart_ns` later it starts to count idle times; after 128
                                                                 times 11 recessive bits it is error active, counters at zero
 
-*Frames of other processes.*  The queues of other processes are not in this model; `hear` tells it of their frames when they are
-over.  If the model's bus was free, it counts as occupied by the frame just before.  Otherwise the frame waits with the others
-and occupies the bus later.  In this way several models that hear each other stand for one bus.
+*Frames of other processes* are not in the queues of this model; `hear` tells it of them when they are over.  If the model's bus
+was free, it counts as occupied by the frame just before.  Otherwise the frame waits with the others and occupies the bus later.
+In this way several models that hear each other stand for one bus.
 """
 
 from collections import defaultdict
@@ -37,10 +37,8 @@ from echelon.bridge.timing.error_draws import INTERFRAME, ErrorDraws
 
 CAPACITY = 64
 """Default length of a node's queue [frames] (SocketCAN's default is 10)"""
-_ERROR_FLAG, _ERROR_DELIMITER = 6, 8
-_SUSPEND = 8
-_EVER = -(2**62)
-_NEVER = 2**62
+_ERROR_FLAG, _ERROR_DELIMITER, _SUSPEND = 6, 8, 8
+_EVER, _NEVER = -(2**62), 2**62
 _OTHERS = -1  # node number for all frames of other processes
 
 
@@ -115,9 +113,7 @@ class ArbitratedBus(BusModel):
         if not self._pending:
             return None
         if self._rate or self._suspended or self._off.nodes:
-            return (
-                self._next_start() + 1
-            )  # only at its start is it known which frame is sent, and whether it is destroyed
+            return self._next_start() + 1  # only then it is known which frame is sent, and whether it is destroyed
         return self._next_start() + self._span(self._pending[0].bits - INTERFRAME)
 
     @property
@@ -237,11 +233,9 @@ class ArbitratedBus(BusModel):
         """Starts the next attempt to send, and decides whether it is destroyed."""
         current = self._pop(start_ns)
         self._note_start(start_ns)
-        hit = (
-            self._draws.hit(self._attempts, self._rate, current.bits)
-            if self._rate and current.node != _OTHERS
-            else None
-        )
+        hit = None
+        if self._rate and current.node != _OTHERS:
+            hit = self._draws.hit(self._attempts, self._rate, current.bits)
         if hit is None:
             on_bus, end = current.bits, current.bits - INTERFRAME
         else:

@@ -1,8 +1,8 @@
 """ROS 2 messages as bytes: definitions (ros2msg) and encoders (CDR, little endian).
 
 A CDR message is four bytes of encapsulation, then its fields.  A number stands at a multiple of its size, counted from the end
-of the encapsulation.  Messages that are written thousands of times a second have a constant size.  So their bytes are laid out
-once (`Layout`); for each message, stamp and float64 values are put into their places.
+of the encapsulation.  The messages that are written most often have a constant size.  So their bytes are laid out once
+(`Layout`), and an encoder only puts the stamp and the float64 values of each message into their places.
 """
 
 import struct
@@ -103,12 +103,15 @@ def stamp(time_ns: int) -> bytes:
 
 
 class Layout:
-    """A message that is laid out field by field, with the places of stamps and float64 values."""
+    """The layout of a message, made field by field."""
 
     def __init__(self) -> None:
         self.body = bytearray()
+        """The bytes behind the encapsulation, zero where values are filled in later"""
         self.stamps: list[int] = []
+        """Places of the stamps in `body`"""
         self.places: list[int] = []
+        """Places of the float64 values that are filled in later, in `body`"""
 
     def put(self, code: str, *values: float) -> "Layout":
         """Adds numbers of one type, given as a code of `struct`."""
@@ -142,7 +145,7 @@ class Layout:
 
 
 class Template:
-    """A laid-out message into which all stamps and all float64 values are put."""
+    """An encoder of messages with one layout that puts in all stamps and all float64 values."""
 
     def __init__(self, layout: Layout) -> None:
         size = 8 + len(layout.body)
@@ -157,23 +160,23 @@ class Template:
         self._places = np.array(layout.places, int) // 8 + 1
 
     def encode(self, time_ns: int, values: Array) -> bytes:
-        """Returns the message; `values` fill the places of the layout in its order."""
+        """Returns the message; `values` (n,) fill the n places of the layout in their order."""
         self._words[self._seconds], self._words[self._nanoseconds] = divmod(time_ns, 1_000_000_000)
         self._doubles[self._places] = values
         return self._message.tobytes()
 
 
 class Splice:
-    """A laid-out message that begins with a header and gets its float64 values as bytes, in order.
+    """An encoder of messages with one layout that begins with a header; it takes the float64 values as bytes, in order.
 
-    It is faster than `Template`, since it only joins constant bytes and pieces of these bytes."""
+    It is faster than `Template`, since it only joins constant bytes and pieces of the given bytes."""
 
     def __init__(self, layout: Layout) -> None:
         starts = [at for at in layout.places if at - 8 not in layout.places]
         ends = [at + 8 for at in layout.places if at + 8 not in layout.places]
         body = bytes(layout.body)
         self.size = 8 * len(layout.places)
-        """Number of bytes of values in a message."""
+        """Number of bytes of values in a message"""
         self._first = body[8 : starts[0]]
         self._end = ends[0] - starts[0]
         self._rest: list[tuple[bytes, int, int]] = []
@@ -209,7 +212,7 @@ def reference(accelerations: int, error_rates: int, forces: int) -> Splice:
 
 
 def command(accelerations: int) -> Splice:
-    """Returns the encoder of echelon_msgs/Command."""
+    """Returns the encoder of echelon_msgs/Command; its values are accelerations."""
     return Splice(Layout().header(WORLD).holes(accelerations))
 
 
@@ -219,7 +222,7 @@ def wheel_torque() -> Splice:
 
 
 def wheels(torques: int) -> Splice:
-    """Returns the encoder of echelon_msgs/Wheels."""
+    """Returns the encoder of echelon_msgs/Wheels; its values are torques, two for each robot."""
     return Splice(Layout().header("").holes(torques))
 
 
@@ -249,7 +252,8 @@ def joint_state(names: Sequence[str]) -> Template:
 
 
 def markers(count: int) -> Layout:
-    """Returns the layout of a visualization_msgs/MarkerArray; exactly `count` markers must follow by `add_marker`."""
+    """Returns the beginning of the layout of a visualization_msgs/MarkerArray.  `add_marker` must then be called `count`
+    times."""
     return Layout().put("I", count)
 
 
@@ -262,7 +266,10 @@ def add_marker(
     color: tuple[float, float, float, float],
     points: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Adds a marker in the frame `WORLD`; its values are x, y, q_z, q_w, or none if it has points."""
+    """Adds a marker in the frame `WORLD`.  Its values are x, y, q_z, q_w; a marker with points [m] has no values.
+
+    `number` tells it apart from others in the namespace; `kind` is `ARROW`, `SPHERE` or `LINE_STRIP`; `scale` is in metres,
+    `color` is red, green, blue, opacity from 0 to 1."""
     layout.header(WORLD).string(namespace).put("i", number, kind, 0)
     if points:
         layout.put("d", *[0.0] * 6, 1.0)
@@ -280,7 +287,7 @@ _FRAME: Final = struct.Struct("<I4xIBBBB8s")  # an empty frame_id, padded to a m
 
 
 def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> bytes:
-    """Returns a can_msgs/Frame; identifiers above 11 bits make it an extended one.  `head` is from `stamp`.
+    """Returns a can_msgs/Frame; with an identifier of more than 11 bits it is an extended frame.  `head` is from `stamp`.
 
     Raises ValueError if `data` is longer than eight bytes."""
     if len(data) > 8:
@@ -289,7 +296,7 @@ def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> by
 
 
 def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:
-    """Returns an echelon_msgs/LinkStatistics; `name` is the link in words."""
+    """Returns an echelon_msgs/LinkStatistics; `name` says which link it is, for people."""
     layout = Layout().header("").put("I", counts.source, counts.receiver).put("B", counts.channel).string(name)
     layout.put("Q", counts.sent, counts.delivered, counts.lost, counts.in_flight, counts.used, counts.held)
     layout.put("d", counts.age_mean_ns).put("q", counts.age_max_ns)

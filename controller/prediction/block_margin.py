@@ -37,5 +37,6 @@ def delay_margin(gains: LinearGains) -> float | None:
         loop = np.asarray((K_1 + 1j * w * K_2 + K_i / (1j * w)) / w**2, dtype=np.complex128)
         return np.asarray(np.linalg.eigvals(loop), dtype=np.complex128)
 
+    # At frequencies above `high` |λ| ≤ ‖L‖ < 1, so there are no crossings.
     high = sum(np.linalg.norm(matrix, 2) ** power for matrix, power in ((K_1, 1 / 2), (K_2, 1), (K_i, 1 / 3)))
     return smallest_delay(crossings(eigenvalues, SLOW * np.abs(found).min(), float(high)))

@@ -1,4 +1,4 @@
-"""How figures look: time where the action is, words beside curves, a second cue beside colour."""
+"""How figures look: their time axes, words beside curves, and dashes and marks besides colours."""
 
 import warnings
 from dataclasses import replace
@@ -74,7 +74,7 @@ SCENARIOS = {groups: scenario_text("my", sizes(groups), None) for groups in ("1x
 
 @pytest.mark.parametrize("text", [*SCENARIOS.values(), readme_scenario()], ids=[*SCENARIOS, "README"])
 def test_no_figure_of_a_first_run_gives_a_warning(text: str) -> None:
-    """Whatever is drawn outside of the axes leaves no room for them."""
+    """matplotlib warns if what is drawn outside the axes leaves no room for the axes."""
     trace = trace_of(parse(text, "my.toml")[1])
     blocks, near = block_series(trace), distances(trace)
     alone = [picture(name, trace, blocks, width) for name in FIGURES for width in (WIDTH, WIDTH / 2)]

@@ -1,4 +1,4 @@
-"""Every check that a run is put to, passed and failed, not tested and switched off."""
+"""Every check of a run: passed, failed, not tested, and switched off."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,7 +29,7 @@ WHEELS = WheelsReport("native", 100, {}, 0.1, came_up=-0.5, enabled=True)
 
 
 def decaying(scale: float = 0.1, *overrides: str, grow: float = 0.0) -> Trace:
-    """A run of the lab scenario: errors fall by e in half a second, and `grow` comes in at 1.2 s for each e."""
+    """A run of the lab scenario of 20 s with errors scale e^(-t/0.5 s) + grow e^((t - 20 s)/1.2 s) [m]."""
     plan = plan_of("lab", "claims=[]", "duration=20.0", *overrides)
 
     def motion(block, seconds):
@@ -41,7 +41,7 @@ def decaying(scale: float = 0.1, *overrides: str, grow: float = 0.0) -> Trace:
 
 
 def counted(plan: Plan, **given: Any) -> list[LinkCounts]:
-    """Counts of all links of a plan; those of the first are as given."""
+    """Returns counts of all links of a plan; the first link has the given counts."""
     every = [LinkCounts(link.source, link.receiver, link.channel, 10, 10, 0, 0, 10, 0, 0.0, 0) for link in plan.links]
     return [replace(every[0], **given), *every[1:]]
 
@@ -63,7 +63,7 @@ def states(trace: Trace, field: str, value: float, robot: int = 0, rows: slice =
 
 
 def without(trace: Trace, robot: int, rows: slice) -> Trace:
-    """The trace without some instants of a robot."""
+    """Returns the trace without some instants of a robot."""
     keep = np.ones(len(trace.times_ns[robot]), dtype=bool)
     keep[rows] = False
     times, values = list(trace.times_ns), list(trace.states)
@@ -219,7 +219,7 @@ def summary_plan(name: str) -> Plan:
 
 
 def made(name: str) -> Trace:
-    """A trace to which a check applies."""
+    """Returns a trace to which a check applies."""
     overrides = {
         "distance": ("avoidance.enabled=false",),
         "drives": ("can.path=closed",),
@@ -229,7 +229,7 @@ def made(name: str) -> Trace:
 
 
 def again(summary: Summary, plan: Plan, name: str) -> Summary:
-    """The same facts about a run with another plan."""
+    """Returns the summary of a run with another plan and the same facts."""
     trace = made(name)
     return judged(Trace(plan, trace.times_ns, trace.states), can=summary.can, run=replace(summary.run, refused=0))
 

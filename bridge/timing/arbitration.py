@@ -76,9 +76,7 @@ class ArbitratedBus(BusModel):
         for name, value, least in (("bit rate", bitrate, 1), ("capacity", capacity, 1), ("restart_ns", restart_ns, 0)):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, not {value!r}")
-        self.bitrate = bitrate
-        self.capacity = capacity
-        self.restart_ns = restart_ns
+        self.bitrate, self.capacity, self.restart_ns = bitrate, capacity, restart_ns
         self.events: list[BusEvent] = []
         self._note_errors = note_errors
         self._traffic: defaultdict[int, Traffic] = defaultdict(Traffic)
@@ -96,10 +94,9 @@ class ArbitratedBus(BusModel):
         self._delivered: list[Delivered] = []
         self._began_ns: int | None = None
         self._now_ns = _EVER  # the model is decided up to this instant
-        self._order = self._busy_ns = 0
+        self._order = self._busy_ns = self._attempts = 0
         self._others = 0  # number of waiting frames of other processes
         self._draws = ErrorDraws(seed, bus_number)
-        self._attempts = 0
         self.set_error_rate(error_rate)
 
     @property

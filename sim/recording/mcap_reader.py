@@ -29,6 +29,7 @@ from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import CHUNK_SIZE, MAGIC, METADATA
 from echelon.sim.recording.recorder import LINKS, SCENARIO, state_topic, torque_topic
+from echelon.sim.recording.ros_definitions import schema_name, schema_text
 from echelon.sim.results.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
@@ -201,11 +202,11 @@ def _messages(path: Path, topics: "dict[str, int] | set[str]", kind: str) -> Ite
             schemas[record.id] = record
         elif isinstance(record, Channel) and record.topic in topics:
             schema = schemas.get(record.schema_id)
-            if schema is None or schema.name != ros.schema_name(kind) or schema.data != ros.schema_text(kind).encode():
-                raise ValueError(f"{record.topic} is not of the {ros.schema_name(kind)} known here")
+            if schema is None or schema.name != schema_name(kind) or schema.data != schema_text(kind).encode():
+                raise ValueError(f"{record.topic} is not of the {schema_name(kind)} known here")
             wanted[record.id] = record.topic
     if not wanted:
-        raise ValueError(f"holds no {ros.schema_name(kind)} of this plan")
+        raise ValueError(f"holds no {schema_name(kind)} of this plan")
 
 
 def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:

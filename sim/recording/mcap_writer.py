@@ -34,7 +34,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from echelon.sim.recording import ros
+from echelon.sim.recording.ros_definitions import schema_name, schema_text
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "echelon"
@@ -81,7 +81,7 @@ class ChunkedFile:
 
         types = list(dict.fromkeys(topics.values()))
         self._schemas = [
-            Schema(id=number, name=ros.schema_name(name), encoding="ros2msg", data=ros.schema_text(name).encode())
+            Schema(id=number, name=schema_name(name), encoding="ros2msg", data=schema_text(name).encode())
             for number, name in enumerate(types, 1)
         ]
         self._channels = [

@@ -15,6 +15,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import ChunkedFile
+from echelon.sim.recording.ros_definitions import ros_name
 from echelon.sim.recording.scene import DESIRED, Scene, desired
 
 SCENARIO: Final = "scenario.toml"
@@ -145,7 +146,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
     for node in plan.nodes:
-        prefix = f"/{ros.ros_name(node.path)}/".replace("//", "/")
+        prefix = f"/{ros_name(node.path)}/".replace("//", "/")
         layout = NodeLayout.of(plan, node)
         if node.parent is not None:
             state = layout.state
@@ -163,14 +164,14 @@ def frame_topics(plan: Plan) -> list[str]:
     """Returns the topics of CAN frames, one for each bus in the order of the plan."""
     if len(plan.can.buses) == 1:
         return [FRAMES]
-    return [f"/can/{ros.ros_name(bus.name)}/frames" for bus in plan.can.buses]
+    return [f"/can/{ros_name(bus.name)}/frames" for bus in plan.can.buses]
 
 
 def state_topic(path: str) -> str:
     """Returns the topic of the state of the robot with this path in the tree."""
-    return f"/{ros.ros_name(path)}/state"
+    return f"/{ros_name(path)}/state"
 
 
 def torque_topic(path: str) -> str:
     """Returns the topic of the wanted torques of the robot with this path, on a closed torque path."""
-    return f"/{ros.ros_name(path)}/torque"
+    return f"/{ros_name(path)}/torque"

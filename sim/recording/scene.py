@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from echelon.messages import STATE_FIELDS, Values
 from echelon.plan.plan import NodePlan, Plan
 from echelon.sim.recording import ros
+from echelon.sim.recording.ros_definitions import ros_name
 from echelon.sim.results.desired import Desired
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ class Scene:
             self.states.append(state)
         self.topics = {TF: "tf2_msgs/TFMessage", MARKERS: "visualization_msgs/MarkerArray"}
         self.topics |= {JOINT_STATES: "sensor_msgs/JointState"}
-        names = [ros.ros_name(robot.path) for robot in plan.robots]
+        names = [ros_name(robot.path) for robot in plan.robots]
         self.topics |= {f"/{name}/odom": "nav_msgs/Odometry" for name in names}
         """Types of the messages that `messages` returns, by topic"""
         self._arm = np.array([robot.arm for robot in plan.robots])

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan.plan import Plan
-from echelon.sim.report.drawing import QUIET, TimeAxis, drawable, short
+from echelon.sim.report.drawing import QUIET, drawable, short
+from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.trace import Trace

@@ -26,7 +26,8 @@ from echelon.sim.report.axes import (
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import Look, Picture, TimeAxis, drawable
+from echelon.sim.report.drawing import Look, Picture, drawable
+from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.report.trajectory_map import X, Y
 from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances

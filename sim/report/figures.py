@@ -20,7 +20,8 @@ from echelon.sim.report.axes import (
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import INK, Look, Picture, TimeAxis, above, drawable, thin
+from echelon.sim.report.drawing import INK, Look, Picture, drawable, thin
+from echelon.sim.report.time_axis import TimeAxis, above
 from echelon.sim.report.trajectory_map import trajectories
 from echelon.sim.results.block_series import Blocks, BlockSeries
 from echelon.sim.results.distances import Distances, distances

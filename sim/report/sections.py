@@ -12,9 +12,9 @@ from echelon.sim.report.axes import (
     torque_time,
 )
 from echelon.sim.report.can_report import can_section
-from echelon.sim.report.drawing import TimeAxis
 from echelon.sim.report.page import figure, fold, paragraph, preformatted, rest, table, tiles
 from echelon.sim.report.run_for_report import FIGURES, RunForReport, ShownRun
+from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.records import DistanceResult
 from echelon.sim.results.summary import number

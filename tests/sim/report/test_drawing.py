@@ -14,8 +14,9 @@ from echelon.cli.new_scenario import scenario_text, sizes
 from echelon.sim.parts.loading import parse
 from echelon.sim.report.axes import PEAKS, TAUS, TorqueScale, distance_time, torque_time
 from echelon.sim.report.comparison import WIDTH, Compared, comparison, longest
-from echelon.sim.report.drawing import GROUPS, RUNS, Look, TimeAxis
+from echelon.sim.report.drawing import GROUPS, RUNS, Look
 from echelon.sim.report.figures import FIGURES, errors, picture
+from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances

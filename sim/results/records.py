@@ -41,6 +41,7 @@ class BlockResult:
     """A block Z_b and its error e(t) over the run; integrals are computed by the trapezoidal rule."""
 
     name: str
+    """Name of the block: path of its group, `inter` or `centroid`"""
     layer: str
     """`intra`, `middle`, `inter` or `centroid`"""
     sigma: float
@@ -107,6 +108,7 @@ class ViolationResult:
     """An unbroken interval in which two robots were not farther apart than the avoidance radius."""
 
     pair: tuple[str, str]
+    """The two robots"""
     first: float
     """Its beginning [s]"""
     last: float
@@ -128,11 +130,13 @@ class DistanceResult:
     between_instants: str
     """The motion that is assumed between the recorded instants"""
     avoidance_enabled: bool
+    """Whether robots avoid each other"""
     avoidance_radius: float
     """[m]"""
     sensing_radius: float
     """[m]"""
     violations: tuple[ViolationResult, ...]
+    """All violations of the avoidance radius, in order of their beginning"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +144,7 @@ class TorqueResult:
     """A robot's wheel torques over its whole run."""
 
     robot: str
+    """Name of the robot"""
     torque_limit: float | None
     """[N m]; None: there is no limit"""
     rms: float | None
@@ -170,9 +175,13 @@ class LinkResult:
     receiver: str
     """Name of the role that receives"""
     channel: str
+    """Channel of the messages, for example `state`"""
     sent: int
+    """Messages that were sent"""
     delivered: int
+    """Messages that arrived"""
     lost: int
+    """Messages that were lost on the link"""
     in_flight: int
     """Messages on their way at the end of the run"""
     used: int
@@ -261,9 +270,11 @@ class Summary:
     """All results of a run."""
 
     format: int
+    """Format of the file; it increases by one whenever a key changes its meaning or is removed"""
     scenario: str
     """Name of the scenario"""
     seed: int
+    """Seed of all random numbers of the run"""
     robots: int
     """Number of robots"""
     duration: float
@@ -275,15 +286,23 @@ class Summary:
     largest_gap: float | None
     """Longest time between two of these instants [s]"""
     verdict: Verdict
+    """What the run showed, with all checks"""
     claims: tuple[ClaimResult, ...]
+    """The claims of the scenario, in its order"""
     blocks: tuple[BlockResult, ...]
+    """The blocks, in the order of the plan"""
     separation: tuple[SeparationResult, ...]
+    """Neighbouring time scales compared, the fastest first"""
     distance: DistanceResult
+    """Distances between robots"""
     torque: tuple[TorqueResult, ...]
+    """Wheel torques, by robot"""
     links: tuple[LinkResult, ...]
+    """Messages, by link; empty if they were not counted"""
     can: CanReport | None
     """None if the run had no bus"""
     run: RunFacts
+    """How the run was run"""
     trace_digest: str
     """SHA-256 over all states of all robots (`results.trace.Digest`)"""
     parts: tuple[PartResult, ...] = ()

@@ -23,6 +23,7 @@ class CheckResult:
     name: str
     """`claim`, or one of the health checks of docs/scenario.md"""
     outcome: Outcome
+    """`not tested`: the check applies to the run, but there was nothing to look at; or it is switched off"""
     text: str
     """The result in one sentence"""
     measured: float | None = None
@@ -41,7 +42,9 @@ class Verdict:
     has no claims, and no check failed.  FAILS: a check failed, or a claim failed or was not tested."""
 
     word: Literal["HOLDS", "HEALTHY", "FAILS"]
+    """The verdict in a word"""
     checks: tuple[CheckResult, ...]
+    """All checks: first the claims, then the health checks"""
 
     @property
     def fails(self) -> bool:

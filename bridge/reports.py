@@ -42,7 +42,7 @@ class BusEvent:
     node: int
     """Number of the node on its bus"""
     who: str
-    """Name of the node: `bridge`, or the robot whose drive it is"""
+    """Name of the node: `bridge`, or that of a drive: its robot, and the wheel if each wheel has a drive of its own"""
     event: str
     """What happened, for example `bus-off`"""
 

@@ -14,7 +14,8 @@ from echelon.shipped import EFFECTIVE
 from echelon.sim.finished_run import Run
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import CutError, read_trace
-from echelon.sim.report.report import RunForReport, write_report
+from echelon.sim.report.report import write_report
+from echelon.sim.report.run_for_report import RunForReport
 from echelon.sim.results.frames import FrameDecoder, frame_data
 from echelon.sim.results.rendering import read_summary
 

@@ -1,6 +1,6 @@
-"""The recorder: writes a run as an MCAP file that ROS viewers can open (docs/architecture.md, 6.2).
+"""The recorder: it writes a run as an MCAP file that ROS viewers can open (docs/architecture.md, 6.2).
 
-All times in the file are run times, so the same run gives the same bytes.
+All times in the file are run times, so that the same run gives the same bytes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +15,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import ChunkedFile
+from echelon.sim.recording.ros_definitions import ros_name
 from echelon.sim.recording.scene import DESIRED, Scene, desired
 
 SCENARIO: Final = "scenario.toml"
@@ -24,7 +25,8 @@ FRAMES, LINKS = "/can/frames", "/links"
 
 
 class Recorder:
-    """Writes the messages of a run and the ROS messages that show them.  Messages must come in order of time, then source."""
+    """Writes the messages of a run, and standard ROS messages that show the run in viewers.  Messages must come in order of
+    time, then source."""
 
     def __init__(
         self,
@@ -65,7 +67,7 @@ class Recorder:
         return self._file.failure
 
     def record(self, message: Message) -> None:
-        """Takes a message.  Raises ValueError for a wrong number of values."""
+        """Writes a message.  Raises ValueError if it has not the number of values that its channel has in the plan."""
         raw = message.values.tobytes()
         if not raw:
             self.null_messages += 1
@@ -84,7 +86,7 @@ class Recorder:
             self._scene.states[source] = message.values
 
     def record_frame(self, timed: TimedFrame) -> None:
-        """Takes a CAN frame.  Frames from before run time 0 are not written; they are in can.log."""
+        """Writes a CAN frame.  Frames from before run time 0 are not written; they are in can.log."""
         time_ns, bus, _, (can_id, data, remote) = timed
         if self._file.failure is None and time_ns >= 0 and bus < len(self._frames):
             frame = ros.can_frame(ros.stamp(time_ns), can_id, data, remote)
@@ -92,7 +94,7 @@ class Recorder:
             self._frames[bus] += 1
 
     def record_links(self, time_ns: int, links: Sequence[LinkCounts]) -> None:
-        """Takes the counts of links at an instant."""
+        """Writes the counts of links at an instant."""
         members = self._plan.all_roles
         for counts in links if self._file.failure is None else ():
             name = f"{members[counts.source].name} to {members[counts.receiver].name}"
@@ -101,7 +103,8 @@ class Recorder:
             self._link_messages += 1
 
     def flush_if_due(self, monotonic_ns: int) -> None:
-        """Secures what was recorded so far against a kill; should be called at least ten times a second."""
+        """Writes to disk what was recorded so far, so that a kill does not cost it; should be called at least ten times a
+        second of wall time `monotonic_ns`."""
         self._file.flush_if_due(monotonic_ns)
 
     def close(self) -> None:
@@ -110,14 +113,14 @@ class Recorder:
         self._file.close()
 
     def _advance(self, time_ns: int) -> None:
-        """Ends the present instant, since all its messages have come, and shows it if that is due."""
+        """Begins a new instant: all messages of the last one have come, and the scene of it is written if that is due."""
         if time_ns > self._now:
             self._show()
         self._now = time_ns
         self._head = ros.stamp(time_ns)
 
     def _show(self) -> None:
-        """Writes the ROS messages that show the instant that ends, if that is due."""
+        """Writes the ROS messages that show the instant that ends, if `display_period_ns` have passed since the last time."""
         if self._now < self._next_display or self._file.failure is not None:
             return
         for topic, data in self._scene.messages(self._now):
@@ -128,7 +131,7 @@ class Recorder:
 
 
 def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
-    """Returns the types of all topics, and topic and encoder of each kind of message by 16 * source + channel."""
+    """Returns the types of all topics by topic, and the topic and encoder of each kind of message by 16 * source + channel."""
     topics: dict[str, str] = {}
     routes: dict[int, tuple[str, ros.Splice]] = {}
 
@@ -143,7 +146,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
     for node in plan.nodes:
-        prefix = f"/{ros.ros_name(node.path)}/".replace("//", "/")
+        prefix = f"/{ros_name(node.path)}/".replace("//", "/")
         layout = NodeLayout.of(plan, node)
         if node.parent is not None:
             state = layout.state
@@ -158,17 +161,17 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
 
 
 def frame_topics(plan: Plan) -> list[str]:
-    """Returns the topics of the frames, one for each bus."""
+    """Returns the topics of CAN frames, one for each bus in the order of the plan."""
     if len(plan.can.buses) == 1:
         return [FRAMES]
-    return [f"/can/{ros.ros_name(bus.name)}/frames" for bus in plan.can.buses]
+    return [f"/can/{ros_name(bus.name)}/frames" for bus in plan.can.buses]
 
 
 def state_topic(path: str) -> str:
-    """Returns the topic of a robot's state."""
-    return f"/{ros.ros_name(path)}/state"
+    """Returns the topic of the state of the robot with this path in the tree."""
+    return f"/{ros_name(path)}/state"
 
 
 def torque_topic(path: str) -> str:
-    """Returns the topic of the torques that a robot wants, on a closed torque path."""
-    return f"/{ros.ros_name(path)}/torque"
+    """Returns the topic of the wanted torques of the robot with this path, on a closed torque path."""
+    return f"/{ros_name(path)}/torque"

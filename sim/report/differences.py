@@ -1,4 +1,4 @@
-"""What differs between the scenarios of several runs, and how they were run."""
+"""The table of differences between several runs: keys of their scenarios, and how they were run."""
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,7 +9,9 @@ import tomlkit
 from echelon.sim.results.records import Summary
 
 ABSENT: Final = "–"
+"""Shown for a key that a scenario does not have"""
 RUN_KEYS: Final = ("engine", "clock", "version")
+"""Fields of `RunFacts` that are compared"""
 
 
 def differences(scenarios: Sequence[str], summaries: Sequence[Summary]) -> list[list[str]]:

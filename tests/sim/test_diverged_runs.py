@@ -66,6 +66,10 @@ def test_the_bus_of_a_stopped_run_is_judged_up_to_the_stop_and_the_cause_is_told
     stop = f"up to {summary['simulated']:g} s, where the run was stopped"
     assert checks["referee"]["text"].endswith(stop)
     assert summary["can"]["referee"]["until"] == summary["simulated"]
+    times_s = [float(line.partition(")")[0][1:]) for line in (folder / "can.log").read_text().splitlines()]
+    later = sum(time_s > summary["simulated"] for time_s in times_s)
+    assert summary["can"]["referee"]["later"] == later == len(times_s) - summary["can"]["referee"]["frames"] > 0
+    assert f"can.log and the numbers of the buses include {later} later frames, which are not judged" in done.stdout
     said = [line.split(maxsplit=2)[1] for line in done.stdout.splitlines() if line.startswith("  because  ")]
     assert said[:2] == ["whole:", "finite:"]
     assert main(["referee", str(folder)]) == 0  # a second judgement has no findings, either

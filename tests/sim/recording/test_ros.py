@@ -12,23 +12,24 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from echelon.messages import STATE_FIELDS, Channel
 from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
+from echelon.sim.recording.ros_definitions import DEFINITIONS, schema_name, schema_text
 
 
 def make_typestore() -> Any:
     """Returns a rosbags typestore that knows our schema texts and nothing else."""
     store = get_typestore(Stores.EMPTY)
-    for name in ros.DEFINITIONS:
-        store.register(get_types_from_msg(ros.schema_text(name), ros.schema_name(name)))
+    for name in DEFINITIONS:
+        store.register(get_types_from_msg(schema_text(name), schema_name(name)))
     return store
 
 
 STORE = make_typestore()
-FULL_NAMES = sorted(ros.schema_name(name) for name in ros.DEFINITIONS)
+FULL_NAMES = sorted(schema_name(name) for name in DEFINITIONS)
 
 
 def make(name: str, *values: Any) -> Any:
     """Returns a rosbags message of a type, its fields in order."""
-    return STORE.types[ros.schema_name(name)](*values)
+    return STORE.types[schema_name(name)](*values)
 
 
 def header(time_ns: int, frame_id: str) -> Any:
@@ -38,7 +39,7 @@ def header(time_ns: int, frame_id: str) -> Any:
 
 def serialized(name: str, message: Any) -> bytes:
     """Returns a message as bytes, as rosbags serializes it."""
-    return bytes(STORE.serialize_cdr(message, ros.schema_name(name)))
+    return bytes(STORE.serialize_cdr(message, schema_name(name)))
 
 
 times = st.integers(0, 2**31 * 10**9 - 1)

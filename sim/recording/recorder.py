@@ -41,14 +41,14 @@ class Recorder:
         """Number of null messages; they are not written."""
         self._plan = plan
         self._scene = Scene(plan)
-        topics, routes = _routes(plan)
+        topics, known = routes(plan)
         topics |= self._scene.topics | {DESIRED: "visualization_msgs/MarkerArray"}
         self._frame_topics = frame_topics(plan)
         topics |= dict.fromkeys(self._frame_topics, "can_msgs/Frame")
         topics |= {LINKS: "echelon_msgs/LinkStatistics"}
         self._numbers = {topic: number for number, topic in enumerate(topics, 1)}
         self._routes = {
-            key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in routes.items()
+            key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in known.items()
         }
         attachments = {name: text.encode() for name, text in {SCENARIO: scenario_toml, **part_files}.items()}
         self._file = ChunkedFile(path, attachments, metadata, topics)
@@ -127,14 +127,14 @@ class Recorder:
         self._next_display = (self._now // period + 1) * period
 
 
-def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
+def routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
     """Returns the types of all topics, and topic and encoder of each kind of message by 16 * source + channel."""
     topics: dict[str, str] = {}
-    routes: dict[int, tuple[str, ros.Splice]] = {}
+    found: dict[int, tuple[str, ros.Splice]] = {}
 
     def add(channel: Channel, source: int, topic: str, kind: str, splice: ros.Splice) -> None:
         topics[topic] = f"echelon_msgs/{kind}"
-        routes[16 * source + channel] = (topic, splice)
+        found[16 * source + channel] = (topic, splice)
 
     if plan.bridge is not None:
         for robot in plan.robots:
@@ -154,7 +154,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
             add(Channel.REFERENCE, node.index, prefix + "reference", "Reference", encoder)
         if (command := layout.command) is not None:
             add(Channel.COMMAND, node.index, prefix + "command", "Command", ros.command(length(command.accelerations)))
-    return topics, routes
+    return topics, found
 
 
 def frame_topics(plan: Plan) -> list[str]:

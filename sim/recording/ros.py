@@ -192,6 +192,22 @@ class Splice:
             message += constant + values[start:end]
         return message
 
+    def decode(self, message: bytes) -> bytes:
+        """Returns the values of a message that `encode` made.  Raises ValueError if its size or a constant part is another."""
+        at = len(stamp(0)) + len(self._first)
+        size = at + self.size + sum(len(constant) for constant, _, _ in self._rest)
+        if len(message) != size:
+            raise ValueError(f"has {len(message)} bytes, not {size}")
+        values = message[at : at + self._end]
+        at += self._end
+        for constant, start, end in self._rest:
+            if message[at : at + len(constant)] != constant:
+                raise ValueError("has an array of another length")
+            at += len(constant)
+            values += message[at : at + end - start]
+            at += end - start
+        return values
+
 
 def robot_state() -> Splice:
     """Returns the encoder of echelon_msgs/RobotState; its values are `STATE_FIELDS`."""

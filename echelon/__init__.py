@@ -12,6 +12,8 @@ For notebooks and scripts:
     echelon.load("lab")                     a scenario and the plan made from it
     echelon.open_run("runs/demo")           a run from its folder
     echelon.Simulation("lab")               a run step by step
+    echelon.replay("runs/demo", {…})        its messages fed to roles with other values: where their outputs differ
+    echelon.diff("runs/a", "runs/b")        where two runs part
 
 To write parts of your own, derive from `Law`, `Plant`, `Trajectory` or `DriveProtocol` (docs/add-a-law.md,
 docs/add-a-protocol.md).
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
-    from echelon.sim.notebook import Loaded, load, open_run, run
+    from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
     from echelon.sim.simulation import Simulation
 
 __version__ = "0.1.0"
@@ -41,8 +43,10 @@ __all__ = [
     "Trajectory",
     "UserError",
     "__version__",
+    "diff",
     "load",
     "open_run",
+    "replay",
     "run",
 ]
 
@@ -51,10 +55,10 @@ def __getattr__(name: str) -> Any:
     """Imports a public name when it is first used: most processes and commands need only a few of them."""
     found: dict[str, Any] = {}
     match name:
-        case "Loaded" | "load" | "open_run" | "run":
-            from echelon.sim.notebook import Loaded, load, open_run, run
+        case "Loaded" | "diff" | "load" | "open_run" | "replay" | "run":
+            from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
 
-            found = {"Loaded": Loaded, "load": load, "open_run": open_run, "run": run}
+            found = {"Loaded": Loaded, "diff": diff, "load": load, "open_run": open_run, "replay": replay, "run": run}
         case "Run":
             from echelon.sim.finished_run import Run
 

@@ -30,15 +30,22 @@ if TYPE_CHECKING:
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
     from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
+    from echelon.sim.replay.comparison import ChannelComparison, Difference
+    from echelon.sim.replay.difference import RunDifference
+    from echelon.sim.replay.replay import Replay
     from echelon.sim.simulation import Simulation
 
 __version__ = "0.1.0"
 __all__ = [
+    "ChannelComparison",
+    "Difference",
     "DriveProtocol",
     "Law",
     "Loaded",
     "Plant",
+    "Replay",
     "Run",
+    "RunDifference",
     "Simulation",
     "Trajectory",
     "UserError",
@@ -63,6 +70,18 @@ def __getattr__(name: str) -> Any:
             from echelon.sim.finished_run import Run
 
             found = {"Run": Run}
+        case "ChannelComparison" | "Difference":
+            from echelon.sim.replay.comparison import ChannelComparison, Difference
+
+            found = {"ChannelComparison": ChannelComparison, "Difference": Difference}
+        case "Replay":
+            from echelon.sim.replay.replay import Replay
+
+            found = {"Replay": Replay}
+        case "RunDifference":
+            from echelon.sim.replay.difference import RunDifference
+
+            found = {"RunDifference": RunDifference}
         case "Simulation":
             from echelon.sim.simulation import Simulation
 

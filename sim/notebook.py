@@ -93,7 +93,7 @@ def replay(
     tolerance: float = 0.0,
 ) -> "Replay":
     """Feeds the messages that a run recorded to today's roles, and compares what they say with what was recorded:
-    `replay("runs/demo", {"law.epsilon": [0.05, 0.1]}, only="coordinator").first`.
+    `replay("runs/demo", {"law.epsilon": [0.05, 0.1]}, only="coordinator").first_difference`.
 
     `run` is the folder of a run, or a run that has one.  The roles are those of its own scenario with `changes`, or of
     another `scenario` of the same tree.  `only` names robots, nodes or groups.  Values that differ by `tolerance` at most are
@@ -108,7 +108,7 @@ def replay(
 
 
 def diff(first: str | Path | Run, second: str | Path | Run, *, tolerance: float = 0.0) -> "RunDifference":
-    """Says where two runs part: `diff("runs/demo", "runs/again").first` is the first instant, message and value.
+    """Says where two runs part: `diff("runs/demo", "runs/again").first_difference` is the first instant, message and value.
 
     Takes folders of runs, or runs that have one.  Values that differ by `tolerance` at most are equal.  Raises UserError for
     what cannot be read."""

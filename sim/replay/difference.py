@@ -27,7 +27,7 @@ class RunDifference:
     tolerance: float
     channels: tuple[ChannelComparison, ...]
     """Of the members and channels that both runs have"""
-    first: Difference | None
+    first_difference: Difference | None
     """The first difference of all; None if there is none"""
     only_first: tuple[str, ...]
     """What only the first run has: member and channel"""
@@ -50,7 +50,9 @@ class RunDifference:
             "until": self.until,
             "tolerance": self.tolerance,
             "equal": self.equal,
-            "first": None if self.first is None else comparison_json(self.first, words),
+            "first_difference": None
+            if self.first_difference is None
+            else comparison_json(self.first_difference, words),
             "channels": [comparison_json(channel, words) for channel in self.channels],
             "only_first_run": list(self.only_first),
             "only_second_run": list(self.only_second),
@@ -66,8 +68,8 @@ class RunDifference:
         for name, lone in (("A", self.only_first), ("B", self.only_second)):
             lines += [f"  only {name} has {', '.join(lone)}"] if lone else []
         lines += comparison_text(self.channels, ("A", "B"))
-        if self.first is not None:
-            lines.append(f"the runs part {difference_text(self.first, ('A', 'B'))}")
+        if self.first_difference is not None:
+            lines.append(f"the runs part {difference_text(self.first_difference, ('A', 'B'))}")
         elif self.equal:
             lines.append("equal: over this time both runs say the same")
         else:

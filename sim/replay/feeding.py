@@ -2,7 +2,7 @@
 
 Each role is alone.  Its mailbox gets the recorded messages of its sources, whatever other roles say today, so a difference
 stays where it begins.  The mailbox and its links decide which message is in use, from the scenario's seed, the link and the
-number of the message, as in a run in virtual time (docs/architecture.md, 4.1).
+number of the message, as in a run in virtual time (docs/architecture.md, 3.3 and 4.2).
 
 A role keeps its own state: a robot moves from its start under the recorded commands, and its motion adds up.
 """

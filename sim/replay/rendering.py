@@ -101,7 +101,7 @@ def comparison_json(what: ChannelComparison | Difference, words: Words) -> dict[
         "equal": what.equal,
         f"only_{first}": what.only_first,
         f"only_{second}": what.only_second,
-        "first": None if what.first_difference is None else comparison_json(what.first_difference, words),
+        "first_difference": None if what.first_difference is None else comparison_json(what.first_difference, words),
         "largest": None
         if what.largest is None
         else {**comparison_json(what.largest, words), "difference": _distance(what.largest)},

@@ -36,7 +36,7 @@ class Replay:
     """Run time up to which outputs are compared [s]"""
     tolerance: float
     channels: tuple[ChannelComparison, ...]
-    first: Difference | None
+    first_difference: Difference | None
     """The first difference of all; None if all outputs are equal"""
     remarks: tuple[str, ...]
     """What limits the replay"""
@@ -54,7 +54,9 @@ class Replay:
             "until": self.until,
             "tolerance": self.tolerance,
             "equal": self.equal,
-            "first": None if self.first is None else comparison_json(self.first, WORDS),
+            "first_difference": None
+            if self.first_difference is None
+            else comparison_json(self.first_difference, WORDS),
             "channels": [comparison_json(channel, WORDS) for channel in self.channels],
             "remarks": list(self.remarks),
         }
@@ -65,10 +67,10 @@ class Replay:
         lines = [f"{self.run}: {roles}; what they say compared {how} with the recording, up to t = {self.until:g} s"]
         lines += [f"  {remark}" for remark in self.remarks]
         lines += comparison_text(self.channels, WORDS)
-        if self.first is None:
+        if self.first_difference is None:
             lines.append("equal: these roles say what was recorded")
         else:
-            lines.append(f"outputs differ first {difference_text(self.first, WORDS)}")
+            lines.append(f"outputs differ first {difference_text(self.first_difference, WORDS)}")
         return "\n".join(lines)
 
 

@@ -44,7 +44,7 @@ def test_runs_of_the_two_engines_are_equal(runs: tuple[Path, Path]) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert "  run: engine: A inprocess, B processes" in done.stdout.splitlines()
     facts = json.loads(echelon("diff", *runs, "--json").stdout)
-    assert (facts["equal"], facts["first"], facts["until"]) == (True, None, 0.4)
+    assert (facts["equal"], facts["first_difference"], facts["until"]) == (True, None, 0.4)
     assert facts["scenario"] == {"run: engine": ["inprocess", "processes"]}
     assert all(channel["compared"] == channel["equal"] > 0 for channel in facts["channels"])
 
@@ -63,11 +63,11 @@ def test_a_changed_law_differs_first_at_the_start_with_the_coordinator(runs: tup
     assert done.stdout.splitlines()[-1].startswith("outputs differ first at t = ")
     facts = json.loads(echelon("replay", runs[1], *change, "--only", "g2", "--json").stdout)
     assert facts["roles"] == ["g2/r4", "g2/r5", "g2/r6", "g2"]
-    assert (facts["first"]["member"], facts["first"]["channel"]) == ("g2", "command")
-    assert facts["first"]["recorded"] != facts["first"]["computed"]
+    assert (facts["first_difference"]["member"], facts["first_difference"]["channel"]) == ("g2", "command")
+    assert facts["first_difference"]["recorded"] != facts["first_difference"]["computed"]
     (command,) = [channel for channel in facts["channels"] if channel["channel"] == "command"]
     assert command["largest"]["difference"] > 0
-    assert command["first"] == facts["first"]
+    assert command["first_difference"] == facts["first_difference"]
     assert echelon("replay", runs[1], *change, "--only", "g2", "--tolerance", "1e6").returncode == 0
 
 

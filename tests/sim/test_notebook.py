@@ -245,8 +245,12 @@ def test_a_run_is_replayed_with_another_law(lab: echelon.Run) -> None:
     assert echelon.replay(lab).equal
     found = echelon.replay(lab, {"law.epsilon": [0.3, 0.6]}, only="coordinator")
     assert not found.equal
-    assert found.first is not None
-    assert (found.first.time, found.first.member, found.roles) == (0.0, "coordinator", ("coordinator",))
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.roles) == (
+        0.0,
+        "coordinator",
+        ("coordinator",),
+    )
     other = echelon.load("lab", {**SHORT, "law.epsilon": [0.3, 0.6]})
     assert echelon.replay(str(lab.folder), scenario=other, only=["coordinator"]).channels == found.channels
     assert echelon.replay(lab, {"law.epsilon": [0.3, 0.6]}, only="coordinator", tolerance=1e6).equal
@@ -257,8 +261,8 @@ def test_two_runs_are_compared(lab: echelon.Run, tmp_path: Path) -> None:
     assert lab.folder is not None
     assert echelon.diff(lab, lab.folder).equal
     found = echelon.diff(lab, changed)
-    assert found.first is not None
-    assert (found.first.member, found.first.time) == ("coordinator", 0.0)
+    assert found.first_difference is not None
+    assert (found.first_difference.member, found.first_difference.time) == ("coordinator", 0.0)
     assert found.scenario == {"law.lead": ("0.5", "0.0")}
     assert echelon.diff(lab, changed, tolerance=1e6).equal
 

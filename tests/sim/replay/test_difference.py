@@ -34,14 +34,17 @@ def differing(first: Path, second: Path, tolerance: float = 0.0) -> RunDifferenc
     """Compares two runs; checks that the other way round it is the same."""
     found, other = diff_runs(first, second, tolerance), diff_runs(second, first, tolerance)
     assert (found.equal, found.until) == (other.equal, other.until)
-    assert (found.first is None) == (other.first is None)
-    if found.first is not None and other.first is not None and not found.first.lacking:
-        assert (found.first.time, found.first.member, found.first.value) == (
-            other.first.time,
-            other.first.member,
-            other.first.value,
+    assert (found.first_difference is None) == (other.first_difference is None)
+    if found.first_difference is not None and other.first_difference is not None and not found.first_difference.lacking:
+        assert (found.first_difference.time, found.first_difference.member, found.first_difference.value) == (
+            other.first_difference.time,
+            other.first_difference.member,
+            other.first_difference.value,
         )
-        assert (found.first.first, found.first.second) == (other.first.second, other.first.first)
+        assert (found.first_difference.first, found.first_difference.second) == (
+            other.first_difference.second,
+            other.first_difference.first,
+        )
     assert (found.only_first, found.only_second) == (other.only_second, other.only_first)
     return found
 
@@ -58,9 +61,14 @@ def test_one_changed_value_is_named(tmp_path: Path) -> None:
     run = record(tmp_path / "a", "lab")
     changed = record(tmp_path / "b", "lab", alter=planted(3, Channel.STATE, 11, 4, 1e-9))
     found = differing(run, changed)
-    assert found.first is not None
-    assert found.first.second == pytest.approx((found.first.first or 0.0) + 1e-9, abs=1e-15)
-    assert (found.first.time, found.first.member, found.first.channel, found.first.value) == (
+    assert found.first_difference is not None
+    assert found.first_difference.second == pytest.approx((found.first_difference.first or 0.0) + 1e-9, abs=1e-15)
+    assert (
+        found.first_difference.time,
+        found.first_difference.member,
+        found.first_difference.channel,
+        found.first_difference.value,
+    ) == (
         0.11,
         "g2/r4",
         Channel.STATE,
@@ -73,8 +81,8 @@ def test_one_changed_value_is_named(tmp_path: Path) -> None:
 
 def test_a_changed_law_is_first_seen_with_the_coordinator(tmp_path: Path) -> None:
     found = differing(record(tmp_path / "a", "lab"), record(tmp_path / "b", "lab", "law.lead=0.0", "seed=2"))
-    assert found.first is not None
-    assert (found.first.time, found.first.member) == (0.0, "coordinator")
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member) == (0.0, "coordinator")
     assert set(found.scenario) == {"seed", "law.lead"}
     assert found.scenario["law.lead"] == ("0.5", "0.0")
     assert "  law.lead: A 0.5, B 0.0" in str(found).splitlines()
@@ -94,8 +102,8 @@ def test_members_of_one_run_alone_are_named(small: str, tmp_path: Path) -> None:
     found = differing(run, more)
     assert not found.equal
     assert (found.only_first, found.only_second) == ((), ("b/b3 state",))
-    assert found.first is not None
-    assert (found.first.time, found.first.member) == (0.0, "b")  # its centroid is another
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member) == (0.0, "b")  # its centroid is another
     assert "  only B has b/b3 state" in str(found).splitlines()
     states = {channel.member: channel for channel in found.channels if channel.channel is Channel.STATE}
     assert states["a/a1"].compared == 41
@@ -106,8 +114,12 @@ def test_a_message_that_one_run_lacks_is_a_difference(tmp_path: Path) -> None:
         return None if (message.channel, message.sequence) == (Channel.REFERENCE, 9) else message
 
     found = differing(record(tmp_path / "a", "lab"), record(tmp_path / "b", "lab", alter=drop))
-    assert found.first is not None
-    assert (found.first.time, found.first.member, found.first.lacking) == (0.09, "coordinator", "second")
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.first_difference.lacking) == (
+        0.09,
+        "coordinator",
+        "second",
+    )
     assert str(found).endswith("the runs part at t = 0.09 s: coordinator, reference number 9: A only, none B")
 
 
@@ -127,8 +139,12 @@ def test_where_periods_differ_messages_belong_together_by_time(tmp_path: Path) -
     coarse = record(tmp_path / "b", "lab", lead, "periods.acceleration=0.02")
     found = differing(record(tmp_path / "a", "lab", lead), coarse)
     assert {channel.compared for channel in found.channels} == {21}
-    assert found.first is not None
-    assert (found.first.time, found.first.member, found.first.lacking) == (0.02, "g1/r1", "")
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.first_difference.lacking) == (
+        0.02,
+        "g1/r1",
+        "",
+    )
     assert any(remark.startswith("where periods differ") for remark in found.remarks)
 
 

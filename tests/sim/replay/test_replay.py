@@ -48,7 +48,7 @@ def test_without_a_change_all_outputs_are_equal(scenario: str, overrides: tuple[
     plan = plan_of(scenario, *QUICK, *overrides)
     found = replayed(record(tmp_path / "run", scenario, *overrides))
     assert found.equal
-    assert found.first is None
+    assert found.first_difference is None
     assert found.roles == tuple(one.name for one in plan.formation)
     assert found.until == plan.duration_ns / 1e9
     sent = [message for message in messages_of(plan) if message.channel is not Channel.WHEELS and not message.is_null]
@@ -60,10 +60,14 @@ def test_without_a_change_all_outputs_are_equal(scenario: str, overrides: tuple[
 def test_a_changed_value_of_a_command_is_found_with_the_robot_that_heard_it(tmp_path: Path) -> None:
     folder = record(tmp_path / "run", "lab", alter=planted(LEADER, Channel.COMMAND, 7, 3, 0.25))
     found = replayed(folder)
-    assert found.first is not None
-    assert (found.first.time, found.first.member, found.first.channel) == (0.07, "g1", Channel.COMMAND)
-    assert (found.first.sequence, found.first.value) == (7, "ay of g1/r2")
-    assert found.first.first == pytest.approx(found.first.second + 0.25)  # type: ignore[operator]
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.first_difference.channel) == (
+        0.07,
+        "g1",
+        Channel.COMMAND,
+    )
+    assert (found.first_difference.sequence, found.first_difference.value) == (7, "ay of g1/r2")
+    assert found.first_difference.first == pytest.approx(found.first_difference.second + 0.25)  # type: ignore[operator]
     command = channel_of(found, "g1", Channel.COMMAND)
     assert (command.compared, command.equal) == (41, 40)
     differing = {channel.member for channel in found.channels if not channel.is_equal}
@@ -75,8 +79,12 @@ def test_a_changed_value_of_a_command_is_found_with_the_robot_that_heard_it(tmp_
 
 def test_a_changed_state_is_found_with_the_leader_that_heard_it(tmp_path: Path) -> None:
     found = replayed(record(tmp_path / "run", "lab", alter=planted(1, Channel.STATE, 5, 0, 1e-6)))
-    assert found.first is not None
-    assert (found.first.time, found.first.member, found.first.value) == (0.05, "g1/r2", "x")
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.first_difference.value) == (
+        0.05,
+        "g1/r2",
+        "x",
+    )
     assert channel_of(found, "g1/r2", Channel.STATE).equal == 40
     assert channel_of(found, "g1", Channel.GROUP_STATE).equal == 40
     assert channel_of(found, "coordinator", Channel.REFERENCE).is_equal  # it hears what g1 said then
@@ -88,8 +96,12 @@ def test_a_message_that_was_not_recorded_is_computed_only(tmp_path: Path) -> Non
         return None if message[1:3] == (LEADER, 7) and message.channel is Channel.COMMAND else message
 
     found = replayed(record(tmp_path / "run", "lab", alter=drop))
-    assert found.first is not None
-    assert (found.first.member, found.first.sequence, found.first.lacking) == ("g1", 7, "first")
+    assert found.first_difference is not None
+    assert (found.first_difference.member, found.first_difference.sequence, found.first_difference.lacking) == (
+        "g1",
+        7,
+        "first",
+    )
     assert channel_of(found, "g1", Channel.COMMAND).only_second == 1
     assert "command number 7: computed only, none recorded" in str(found)
     head, *_ = (line.split("  ") for line in str(found).splitlines()[1:-1])
@@ -107,9 +119,13 @@ def test_a_changed_law_says_what_it_says_in_a_run_of_its_own(tmp_path: Path) -> 
         for message in messages_of(plan_of("lab", *QUICK, change))
         if (message.source, message.channel, message.sequence) == (ROOT, Channel.REFERENCE, 0)
     ]
-    assert found.first is not None
-    assert (found.first.time, found.first.member, found.first.value) == (0.0, "coordinator", "ax of g1")
-    assert found.first.second == said.values[0]
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.first_difference.value) == (
+        0.0,
+        "coordinator",
+        "ax of g1",
+    )
+    assert found.first_difference.second == said.values[0]
     assert channel_of(found, "coordinator", Channel.REFERENCE).equal == 0
     assert channel_of(found, "g1/r1", Channel.STATE).is_equal  # robots hear what was commanded then
 

@@ -12,8 +12,9 @@ from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE, scenario_path
 from echelon.sim.out_folder import RECORDING, SUMMARY
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
-from echelon.sim.parts.loading import load
+from echelon.sim.parts.loading import load, parse
 from echelon.sim.parts.time_limit import TookTooLong
+from echelon.sim.recording.mcap_reader import read_metadata, read_scenario
 from echelon.sim.recording.messages import read_messages
 from echelon.sim.replay.difference import RunDifference, difference
 from echelon.sim.replay.replay import Replay, Replaying, chosen
@@ -30,13 +31,23 @@ def open_recorded(folder: Path) -> Recorded:
     """Opens the messages that a run recorded, also of a run that was killed.  Raises UserError."""
     if not folder.is_dir():
         raise UsageError(f"{folder}: is not the folder of a run")
-    _, plan = load(folder / EFFECTIVE, trial=False)
+    path = folder / RECORDING
     try:
-        return read_messages(folder / RECORDING, plan)
+        _, plan = parse(read_scenario(path), str(path), folder=folder, trial=False)
+        return read_messages(path, plan)
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
-    except ValueError as error:  # which begins with the file
-        raise UserError(f"{error}; `echelon recover {folder}` keeps what is whole of a damaged recording") from None
+    except (UserError, ValueError) as error:  # which begins with the file
+        raise UserError(f"{error}{_by_another_version(path)}") from None
+
+
+def _by_another_version(path: Path) -> str:
+    """Returns words to follow an error about a recording, if another version wrote it; otherwise ""."""
+    try:
+        then = read_metadata(path).get("echelon")
+    except (OSError, ValueError):
+        return ""
+    return "" if then == version("echelon") else f" (recorded by echelon {then}, this is {version('echelon')})"
 
 
 def replay_run(
@@ -66,12 +77,9 @@ def replay(recorded: Recorded, plan: Plan, folder: Path, only: Sequence[str], to
 def diff_runs(first: Path, second: Path, tolerance: float) -> RunDifference:
     """Compares two runs from their folders.  Raises UserError."""
     check_tolerance(tolerance)
-    folders = (first, second)
-    recorded = [open_recorded(folder) for folder in folders]
-    texts = [(folder / EFFECTIVE).read_text(encoding="utf-8") for folder in folders]
-    rows = differing(texts, [_facts(each.metadata) for each in recorded])
-    scenario = {key: (one, other) for key, one, other in rows}
-    return difference(recorded[0], recorded[1], (str(first), str(second)), scenario, tolerance)
+    one, other = map(open_recorded, (first, second))
+    rows = differing((one.scenario, other.scenario), (_facts(one.metadata), _facts(other.metadata)))
+    return difference(one, other, (str(first), str(second)), {key: (a, b) for key, a, b in rows}, tolerance)
 
 
 def check_tolerance(tolerance: float) -> None:
@@ -92,6 +100,9 @@ def _remarks(recorded: Recorded, folder: Path) -> Iterator[str]:
     other = [f"{key} {then[key]}, now {now}" for key, now in today.items() if then.get(key, now) != now]
     if other:
         yield f"recorded with {'; '.join(other)}: last digits may differ, which --tolerance allows for"
+    scenario = folder / EFFECTIVE
+    if not scenario.is_file() or scenario.read_bytes() != recorded.scenario.encode():
+        yield f"{scenario} is not the scenario that the run used"
     for key, digest in then.items():
         path = folder / Path(key.removeprefix(_HASH)).name
         if key.startswith(_HASH) and (not path.is_file() or sha256(path.read_bytes()).hexdigest() != digest):

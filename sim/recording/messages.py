@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from mcap.records import Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from echelon.messages import Channel as MessageChannel
 from echelon.plan.plan import Plan
 from echelon.sim.recording.mcap_reader import CutError, blame, check_type, records
 from echelon.sim.recording.mcap_writer import METADATA
-from echelon.sim.recording.recorder import routes
+from echelon.sim.recording.recorder import SCENARIO, routes
 from echelon.sim.recording.ros import Splice
 from echelon.sim.results.recorded import Recorded, Series
 
@@ -65,7 +65,7 @@ def read_messages(path: Path, plan: Plan) -> Recorded:
     wanted: dict[int, tuple[str, _Gathered]] = {}
     schemas: dict[int, Schema] = {}
     metadata: dict[str, str] = {}
-    cut = False
+    scenario, cut = "", False
     with blame(path):
         try:
             for record in records(path):
@@ -74,6 +74,8 @@ def read_messages(path: Path, plan: Plan) -> Recorded:
                         found[1].add(found[0], record)
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
+                elif isinstance(record, Attachment):
+                    scenario = record.data.decode() if record.name == SCENARIO else scenario
                 elif isinstance(record, Metadata):
                     metadata |= record.metadata if record.name == METADATA else {}
                 elif isinstance(record, Channel) and record.topic in by_topic:
@@ -84,4 +86,4 @@ def read_messages(path: Path, plan: Plan) -> Recorded:
         gathered = [each.series() for each in by_topic.values() if len(each)]
         if not gathered:
             raise ValueError("holds no messages between roles of this plan")
-    return Recorded(plan, {(each.source, each.channel): each for each in gathered}, metadata, cut)
+    return Recorded(plan, {(each.source, each.channel): each for each in gathered}, metadata, scenario, cut)

@@ -45,6 +45,8 @@ class Recorded:
     """By source and channel; channels without a message are absent"""
     metadata: Mapping[str, str]
     """What the recorder wrote about the run: engine, clock, versions"""
+    scenario: str
+    """The effective scenario as TOML, as the recording has it"""
     cut: bool
     """True if the file is cut off, so that its end is missing"""
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from echelon.sim.recording.recorder import Recorder
 from support.recordings import LOSSY
-from support.runs import EXAMPLES, SCENARIOS, echelon, summary_of
+from support.runs import EXAMPLES, SCENARIOS, echelon, plan_of, summary_of
 
 QUICK = ("--set", "duration=0.4", "--set", "claims=[]", "--quiet", "--no-report")
 
@@ -69,6 +70,29 @@ def test_a_changed_law_differs_first_at_the_start_with_the_coordinator(runs: tup
     assert command["largest"]["difference"] > 0
     assert command["first_difference"] == facts["first_difference"]
     assert echelon("replay", runs[1], *change, "--only", "g2", "--tolerance", "1e6").returncode == 0
+
+
+def test_a_law_that_is_changed_in_the_runs_own_scenario_is_judged_and_told(
+    runs: tuple[Path, Path], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(runs[0], tmp_path / "run")
+    scenario = folder / "scenario.toml"
+    scenario.write_text(scenario.read_text().replace("lead = 0.5", "lead = 0.25"))
+    done = echelon("replay", folder)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert f"  {scenario} is not the scenario that the run used" in done.stdout.splitlines()
+    assert done.stdout == echelon("replay", folder, "--scenario", runs[0], "--set", "law.lead=0.25").stdout
+    assert echelon("diff", runs[0], folder).returncode == 0  # the recordings are the same
+
+
+def test_a_recording_that_another_version_wrote_and_nobody_reads_is_told_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    toml = (SCENARIOS / "lab.toml").read_text().replace("seed =", "sede =")
+    Recorder(path, plan_of("lab"), toml, {"echelon": "0.0.1"}).close()
+    done = echelon("replay", tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    says = f"echelon: {path}: sede: unknown key; did you mean 'seed'? (recorded by echelon 0.0.1, this is 0.1.0)"
+    assert done.stderr == f"{says}\n"
 
 
 def test_what_is_whole_of_a_killed_run_is_compared(runs: tuple[Path, Path], tmp_path: Path) -> None:
@@ -151,7 +175,7 @@ def test_mistakes_are_one_line(runs: tuple[Path, Path], tmp_path: Path) -> None:
     (bare / "run.mcap").unlink()
     for arguments, says in [
         (("replay", "nowhere"), "echelon: nowhere: is not the folder of a run"),
-        (("replay", empty), f"echelon: {empty}/scenario.toml: "),
+        (("replay", empty), f"echelon: {empty}/run.mcap: No such file or directory"),
         (("replay", bare), f"echelon: {bare}/run.mcap: No such file or directory"),
         (("replay", damaged), f"echelon: {damaged}/run.mcap: is damaged"),
         (("replay", folder, "--only", "g9"), "echelon: g9: no robot and no node of this run"),

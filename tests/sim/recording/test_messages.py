@@ -40,6 +40,7 @@ def test_all_messages_come_back_bit_for_bit(scenario: str, overrides: tuple[str,
         assert series.values.tobytes() == b"".join(message.values.tobytes() for message in expected[key])
     assert not recorded.cut
     assert recorded.whole_until_ns() == plan.duration_ns + 1
+    assert recorded.scenario == (folder / "scenario.toml").read_text()
     assert recorded.metadata == {"engine": "inprocess", "clock": "virtual"}
 
 

@@ -86,10 +86,11 @@ Parts of yours are the copies in the run's folder; --scenario FILE takes those b
         options=DiffOptions,
         work=diff,
         about="""\
-Compares what two runs recorded, message by message, and names the first difference: run time,
-member, channel, value, and what each run has.  Of one instant it is the difference in the
-earliest turn, from which others may follow.  It says which keys of the scenarios differ.
-Runs of different lengths are compared up to the end of the shorter one.""",
+Compares the messages between robots and nodes that two runs recorded, and names the first
+difference: run time, member, channel, value, and what each run has.  Of one instant it is the
+difference in the earliest turn, from which others may follow.  It says which keys of the
+scenarios differ.  Runs of different lengths are compared up to the end of the shorter one.
+CAN frames are not compared; of a closed torque path the torques are.""",
         examples={
             "echelon diff runs/demo runs/avoiding": "the first instant, message and value at which they part",
             "echelon diff runs/demo runs/avoiding --tolerance 1e-6": "smaller differences count as equal",

@@ -93,16 +93,15 @@ class Feeding:
     Raises PartRunError while it runs if a part that is not built in fails."""
 
     def __init__(self, plan: Plan, recorded: Recorded, indices: Sequence[int], until_ns: int) -> None:
-        self._replayed = [_Replayed(plan, recorded, index) for index in indices]
-        self._until_ns = until_ns
+        self._plan, self._recorded, self._indices, self._until_ns = plan, recorded, indices, until_ns
+        self.series: dict[tuple[int, Channel], Series] = {}
+        """What the roles that are done have sent, by source and channel"""
 
     def instants(self) -> Iterator[int]:
         """Runs all roles, one after the other; yields each instant [ns] when it is done."""
-        for one in self._replayed:
+        for index in self._indices:
+            one = _Replayed(self._plan, self._recorded, index)
             for time_ns in range(0, self._until_ns, one.tick_ns):
                 one.advance(time_ns)
                 yield time_ns
-
-    def series(self) -> dict[tuple[int, Channel], Series]:
-        """Returns what the roles have sent so far, by source and channel."""
-        return {(each.source, each.channel): each for one in self._replayed for each in one.series()}
+            self.series |= {(each.source, each.channel): each for each in one.series()}

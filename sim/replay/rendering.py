@@ -4,11 +4,14 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Any, Final
 
+from echelon.messages import Channel
 from echelon.sim.replay.comparison import ChannelComparison, Difference
 
 Words = tuple[str, str]
 """What the first and the second series are called"""
 NOTHING: Final = "–"
+MOST_LINES: Final = 40
+"""How many lines a table may have before members without a difference share a line"""
 
 
 def difference_text(difference: Difference, words: Words) -> str:
@@ -23,23 +26,19 @@ def difference_text(difference: Difference, words: Words) -> str:
 
 
 def comparison_text(channels: Sequence[ChannelComparison], words: Words) -> list[str]:
-    """Returns a table with a line for each member and channel."""
+    """Returns a table with a line for each member and channel.  If it would have more than `MOST_LINES`, members of whose
+    channel everything is the same share a line."""
     lone = any(channel.only_first or channel.only_second for channel in channels)
     counts = ["messages", "equal", *((f"{words[0]} only", f"{words[1]} only") if lone else ())]
-    rows = [["member", "channel", *counts, "first difference", "largest difference"]]
-    for channel in channels:
-        alone = [str(channel.only_first), str(channel.only_second)] if lone else []
-        rows.append(
-            [
-                channel.member,
-                channel.channel.name.lower(),
-                str(channel.compared),
-                str(channel.equal),
-                *alone,
-                _first(channel, words),
-                _largest(channel),
-            ]
-        )
+    rows = [["member", "channel", *counts, f"first difference ({words[0]}, {words[1]})", "largest difference"]]
+    shared = {channel: [each for each in channels if each.channel is channel and _is_same(each)] for channel in Channel}
+    for each in channels:
+        same = shared[each.channel] if len(channels) > MOST_LINES and _is_same(each) else [each]
+        if same[0] is each:
+            name = each.member if len(same) == 1 else f"{len(same)} members"
+            sums = [sum(numbers) for numbers in zip(*map(_counts, same), strict=True)][: len(counts)]
+            row = [name, each.channel.name.lower(), *map(str, sums), _first(each, words), _largest(each)]
+            rows.append(row)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     right = range(2, 2 + len(counts))
     return [
@@ -50,6 +49,15 @@ def comparison_text(channels: Sequence[ChannelComparison], words: Words) -> list
         ).rstrip()
         for row in rows
     ]
+
+
+def _counts(channel: ChannelComparison) -> tuple[int, ...]:
+    return channel.compared, channel.equal, channel.only_first, channel.only_second
+
+
+def _is_same(channel: ChannelComparison) -> bool:
+    """Returns whether all messages are the same and in both series."""
+    return channel.is_equal and channel.largest is None and not (channel.only_first or channel.only_second)
 
 
 def _first(channel: ChannelComparison, words: Words) -> str:

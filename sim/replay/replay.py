@@ -155,7 +155,7 @@ class Replaying:
 
     def result(self, run: str, remarks: Sequence[str] = ()) -> Replay:
         """Returns the result, after all instants; `run` names the run."""
-        plan, computed = self._plan, self._feeding.series()
+        plan, computed = self._plan, self._feeding.series
         channels = []
         for index in self._indices:
             for channel in message_sizes_of(plan, plan.formation[index]):

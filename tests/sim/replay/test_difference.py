@@ -1,13 +1,20 @@
 """sim.replay.difference: the first place at which two runs part, over the time and the members that both have."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from echelon.errors import UsageError
 from echelon.messages import Channel, Message
-from echelon.sim.recorded_runs import diff_runs
-from echelon.sim.replay.difference import RunDifference
+from echelon.sim.recorded_runs import diff_runs, open_recorded
+from echelon.sim.replay.difference import RunDifference, difference
+from echelon.sim.replay.value_names import value_names
+from echelon.sim.results.recorded import Recorded
 from support.recordings import planted, record
 
 SMALL = """
@@ -156,6 +163,46 @@ def test_runs_without_a_common_member_are_refused(small: str, tmp_path: Path) ->
 
     with pytest.raises(UsageError, match="have no member of the same path"):
         diff_runs(a, record(tmp_path / "b", "lab", alter=drop), 0.0)
+
+
+def test_of_many_members_those_without_a_difference_share_a_line(tmp_path: Path) -> None:
+    quick = "duration=0.02"
+    changed = record(tmp_path / "b", "three_levels", quick, alter=planted(5, Channel.STATE, 1, 0, 0.5))
+    text = str(differing(record(tmp_path / "a", "three_levels", quick), changed)).splitlines()
+    states = [line.split() for line in text if " state " in line][:2]
+    assert [row[:5] for row in states] == [
+        ["26", "members", "state", str(26 * 3), str(26 * 3)],
+        ["west/g2/r6", "state", "3", "2", "t"],
+    ]
+    assert len(text) == 1 + 1 + 2 + 3 + 1  # heading, table with states, group states, references and commands, sentence
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """A run with all channels: on the closed torque path, with avoidance."""
+    folder = tmp_path_factory.mktemp("drives")
+    return open_recorded(record(folder, "drives", "duration=0.1", "avoidance.enabled=true"))
+
+
+@given(st.data(), st.sampled_from([1e-9, -1.0, np.nan, np.inf]))
+def test_wherever_a_value_is_changed_it_is_found(drives: Recorded, data: st.DataObject, change: float) -> None:
+    key = data.draw(st.sampled_from(sorted(drives.series)))
+    series = drives.series[key]
+    row, column = (data.draw(st.integers(0, size - 1)) for size in series.values.shape)
+    values = series.values.copy()
+    values[row, column] += change
+    changed = replace(drives, series={**drives.series, key: replace(series, values=values)})
+    found = difference(drives, changed, ("a", "b"), {}, 0.0)
+    first = found.first_difference
+    assert first is not None
+    source, channel = key
+    assert (first.member, first.channel) == (drives.plan.all_roles[source].name, channel)
+    assert (first.time_ns, first.sequence) == (series.times_ns[row], series.sequences[row])
+    assert first.value == value_names(drives.plan, source, channel)[column]
+    assert first.first == series.values[row, column]
+    assert first.second == values[row, column] or np.isnan(change)
+    assert sum(each.compared - each.equal for each in found.channels) == 1
+    assert json.loads(json.dumps(found.to_json(), allow_nan=False))["equal"] is False
 
 
 @pytest.mark.parametrize("tolerance", [-1e-9, float("nan")])

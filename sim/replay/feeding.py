@@ -47,7 +47,9 @@ class _Source:
 
 
 class _Replayed:
-    """One role with its mailbox, its recorded sources, and what it has sent."""
+    """One role with its mailbox, its recorded sources, and what it has sent.
+
+    Messages are delivered a period ahead: the mailbox hands them out when their links say."""
 
     def __init__(self, plan: Plan, recorded: Recorded, index: int) -> None:
         self.role: Role = make_role(plan, index)
@@ -63,12 +65,13 @@ class _Replayed:
         ]
         self._stages = list(enumerate(self.role.stages))
         self.tick_ns = gcd(*[stage.period_ns for stage in self.role.stages])
+        self._ahead_ns = max(stage.period_ns for stage in self.role.stages) - 1
         self._sent: dict[Channel, list[Message]] = {}
 
     def advance(self, time_ns: int) -> None:
         """Runs the stages of an instant."""
         for source in self._sources:
-            source.deliver(self._mailbox, time_ns)
+            source.deliver(self._mailbox, time_ns + self._ahead_ns)
         for number, stage in self._stages:
             if time_ns % stage.period_ns == 0 and time_ns >= stage.first_ns:
                 for message in stage.run(time_ns, self._mailbox.take(number, time_ns)):

@@ -161,7 +161,7 @@ class Replaying:
             for channel in message_sizes_of(plan, plan.formation[index]):
                 key, names = (index, channel), value_names(plan, index, channel)
                 said = self._recorded.series.get(key, _nothing(*key, len(names))).before(self._until_ns)
-                now = computed.get(key, _nothing(*key, len(names)))
+                now = computed.get(key, _nothing(*key, len(names))).before(self._until_ns)
                 channels.append(
                     compare(
                         plan,

@@ -73,7 +73,7 @@ class Recorded:
         if not self.cut and min(ends_ns) > self.plan.duration_ns:
             return self.plan.duration_ns + 1
         periods = {(link.source, link.channel): link.period_ns for link in self.plan.links}
-        ends_ns += [int(series.times_ns[-1]) + periods[key] for key, series in self.series.items() if key in periods]
+        ends_ns += [(int(each.sequences[-1]) + 1) * periods[key] for key, each in self.series.items() if key in periods]
         return min(ends_ns)
 
 

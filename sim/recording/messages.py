@@ -1,6 +1,7 @@
 """Reading back the messages between roles, value by value, from a recording that is complete or cut off."""
 
 from array import array
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -11,8 +12,8 @@ from echelon.messages import Channel as MessageChannel
 from echelon.plan.plan import Plan
 from echelon.sim.recording.mcap_reader import CutError, blame, check_type, records
 from echelon.sim.recording.mcap_writer import METADATA
-from echelon.sim.recording.recorder import SCENARIO, routes
-from echelon.sim.recording.ros import Splice
+from echelon.sim.recording.recorder import NULLS, SCENARIO, routes
+from echelon.sim.recording.ros import NULL_MESSAGE, Splice, stamp
 from echelon.sim.results.recorded import Recorded, Series
 
 _NUMBERS: Final = 1 << 32
@@ -56,13 +57,36 @@ class _Gathered:
         return len(self._sequences)
 
 
+class _Nulls:
+    """The null messages of all sources, as they are read."""
+
+    def __init__(self, known: Collection[int]) -> None:
+        self._known = known
+        self.found: dict[tuple[int, MessageChannel], dict[int, int]] = {}
+        """By source and channel, times [ns] by number"""
+
+    def add(self, topic: str, message: Message) -> None:
+        """Takes a message.  Raises ValueError if it has another shape, or its source sends nothing on its channel."""
+        at = len(stamp(0))
+        if len(message.data) != at + NULL_MESSAGE.size:
+            raise ValueError(f"a message of {topic} has {len(message.data)} bytes, not {at + NULL_MESSAGE.size}")
+        _, source, channel, sequence = NULL_MESSAGE.unpack_from(message.data, at)
+        if channel >= 16 or 16 * source + channel not in self._known:
+            raise ValueError(f"{topic} names source {source} and channel {channel}, which are not of this plan")
+        self.found.setdefault((source, MessageChannel(channel)), {})[sequence] = message.log_time
+
+
 def read_messages(path: Path, plan: Plan) -> Recorded:
     """Returns the messages of a recording, bit for bit; of a file that is cut off, those up to the cut.
 
     Raises ValueError if the file is damaged, not a recording, or not of this plan."""
     types, known = routes(plan)
-    by_topic = {topic: _Gathered(key // 16, MessageChannel(key % 16), splice) for key, (topic, splice) in known.items()}
-    wanted: dict[int, tuple[str, _Gathered]] = {}
+    nulls = _Nulls(known.keys())
+    by_topic: dict[str, _Gathered | _Nulls] = {NULLS: nulls}
+    gathered = {topic: _Gathered(key // 16, MessageChannel(key % 16), splice) for key, (topic, splice) in known.items()}
+    by_topic |= gathered
+    types[NULLS] = "echelon_msgs/NullMessage"
+    wanted: dict[int, tuple[str, _Gathered | _Nulls]] = {}
     schemas: dict[int, Schema] = {}
     metadata: dict[str, str] = {}
     scenario, cut = "", False
@@ -83,7 +107,7 @@ def read_messages(path: Path, plan: Plan) -> Recorded:
                     wanted[record.id] = record.topic, by_topic[record.topic]
         except CutError:
             cut = True
-        gathered = [each.series() for each in by_topic.values() if len(each)]
-        if not gathered:
+        series = [each.series() for each in gathered.values() if len(each)]
+        if not series:
             raise ValueError("holds no messages between roles of this plan")
-    return Recorded(plan, {(each.source, each.channel): each for each in gathered}, metadata, scenario, cut)
+    return Recorded(plan, {(each.source, each.channel): each for each in series}, nulls.found, metadata, scenario, cut)

@@ -21,6 +21,8 @@ SCENARIO: Final = "scenario.toml"
 """The name of the attachment that holds the effective scenario."""
 FRAMES, LINKS = "/can/frames", "/links"
 """Topics of frames and of counts of links.  With several buses, the topics of frames have their names: `/can/can1/frames`."""
+NULLS: Final = "/nulls"
+"""Topic of null messages: which source sent one, on which channel, and its number"""
 
 
 class Recorder:
@@ -38,14 +40,14 @@ class Recorder:
 
         The scenario and the texts `part_files` (by name) become attachments; `metadata`, such as versions, become metadata."""
         self.null_messages = 0
-        """Number of null messages; they are not written."""
+        """Number of null messages"""
         self._plan = plan
         self._scene = Scene(plan)
         topics, known = routes(plan)
         topics |= self._scene.topics | {DESIRED: "visualization_msgs/MarkerArray"}
         self._frame_topics = frame_topics(plan)
         topics |= dict.fromkeys(self._frame_topics, "can_msgs/Frame")
-        topics |= {LINKS: "echelon_msgs/LinkStatistics"}
+        topics |= {LINKS: "echelon_msgs/LinkStatistics", NULLS: "echelon_msgs/NullMessage"}
         self._numbers = {topic: number for number, topic in enumerate(topics, 1)}
         self._routes = {
             key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in known.items()
@@ -67,14 +69,16 @@ class Recorder:
     def record(self, message: Message) -> None:
         """Takes a message.  Raises ValueError for a wrong number of values."""
         raw = message.values.tobytes()
-        if not raw:
-            self.null_messages += 1
-            return
+        self.null_messages += not raw
         if self._file.failure is not None:
             return
         if message.time_ns != self._now:
             self._advance(message.time_ns)
         source, channel = message.source, message.channel
+        if not raw:
+            null = ros.null_message(self._head, source, channel, message.sequence)
+            self._file.add(self._numbers[NULLS], self.null_messages - 1, self._now, null)
+            return
         number, size, encode = self._routes[16 * source + channel]
         if len(raw) != size:
             name = self._plan.all_roles[source].name

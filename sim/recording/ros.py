@@ -67,6 +67,7 @@ DEFINITIONS: Final = {
     "echelon_msgs/Command": _HEADER + "float64[] accelerations\n",
     "echelon_msgs/WheelTorque": _HEADER + "".join(f"float64 {name}\n" for name in TORQUE_FIELDS),
     "echelon_msgs/Wheels": _HEADER + "float64[] torques\n",
+    "echelon_msgs/NullMessage": _HEADER + "uint32 source\nuint8 channel\nuint64 sequence\n",
     "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
     "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
     "float64 age_mean_ns\nint64 age_max_ns\n",
@@ -302,6 +303,16 @@ def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> by
     if len(data) > 8:
         raise ValueError(f"CAN frame {can_id:#x} holds {len(data)} bytes; can_msgs/Frame takes at most 8")
     return head + _FRAME.pack(1, can_id, remote, can_id > 0x7FF, False, len(data), data)
+
+
+NULL_MESSAGE: Final = struct.Struct("<I4xIB3xQ")
+"""Of an echelon_msgs/NullMessage what follows the stamp: an empty frame_id, padded to a multiple of four; source, channel,
+sequence number"""
+
+
+def null_message(head: bytes, source: int, channel: int, sequence: int) -> bytes:
+    """Returns an echelon_msgs/NullMessage.  `head` is from `stamp`."""
+    return head + NULL_MESSAGE.pack(1, source, channel, sequence)
 
 
 def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:

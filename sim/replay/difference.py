@@ -93,7 +93,7 @@ def difference(
     until_ns = min(ends_ns)
     if until_ns <= 0:
         lacks = names[ends_ns.index(until_ns)]
-        raise UsageError(f"{lacks}: the recording lacks states of robots from the start: nothing can be compared")
+        raise UsageError(f"{lacks}: the recording lacks messages from the start: nothing can be compared")
     kinds = [_kinds(run) for run in (first, second)]
     periods = [{(link.source, link.channel): link.period_ns for link in run.plan.links} for run in (first, second)]
     channels, coarse = [], False

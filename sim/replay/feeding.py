@@ -21,29 +21,30 @@ from echelon.sim.results.recorded import Recorded, Series
 
 
 class _Source:
-    """The recorded messages of one link into a role, delivered in order of time."""
+    """The recorded messages of one link into a role, delivered in order of their numbers."""
 
-    def __init__(self, link: LinkPlan, series: Series | None, *, nulls: bool) -> None:
-        self._link, self._series, self._nulls = link, series, nulls
+    def __init__(self, link: LinkPlan, recorded: Recorded) -> None:
+        key = link.source, link.channel
+        self._link, self._series, self._nulls = link, recorded.series.get(key), recorded.nulls.get(key, {})
         self._number = self._row = 0
 
     def deliver(self, mailbox: Mailbox, until_ns: int) -> None:
-        """Delivers the messages that were sent up to `until_ns`.  With `nulls`, a message that was not recorded was null."""
-        link, series = self._link, self._series
+        """Delivers the messages that are due up to `until_ns`; one that was not recorded is missing."""
+        link = self._link
         while link.first_ns + self._number * link.period_ns <= until_ns:
-            values = NULL
-            time_ns = link.first_ns + self._number * link.period_ns
-            recorded = (
-                series is not None
-                and self._row < len(series.sequences)
-                and int(series.sequences[self._row]) == self._number
-            )
-            if series is not None and recorded:
-                values, time_ns = series.values[self._row], int(series.times_ns[self._row])
-                self._row += 1
-            if recorded or self._nulls:
-                mailbox.deliver(Message(link.channel, link.source, self._number, time_ns, values))
+            if (message := self._next()) is not None:
+                mailbox.deliver(message)
             self._number += 1
+
+    def _next(self) -> Message | None:
+        """Returns the message with the present number, if it was recorded."""
+        series, row, number, link = self._series, self._row, self._number, self._link
+        if series is not None and row < len(series.sequences) and series.sequences[row] == number:
+            self._row += 1
+            return Message(link.channel, link.source, number, int(series.times_ns[row]), series.values[row])
+        if (time_ns := self._nulls.get(number)) is not None:
+            return Message(link.channel, link.source, number, time_ns, NULL)
+        return None
 
 
 class _Replayed:
@@ -54,15 +55,7 @@ class _Replayed:
     def __init__(self, plan: Plan, recorded: Recorded, index: int) -> None:
         self.role: Role = make_role(plan, index)
         self._mailbox = Mailbox(self.role, plan)
-        self._sources = [
-            _Source(
-                link,
-                recorded.series.get((link.source, link.channel)),
-                # a robot sends no null messages; on a wall clock a recorder may have missed its state
-                nulls=not (recorded.by_arrival and link.channel is Channel.STATE),
-            )
-            for link in plan.links_into(index)
-        ]
+        self._sources = [_Source(link, recorded) for link in plan.links_into(index)]
         self._stages = list(enumerate(self.role.stages))
         self.tick_ns = gcd(*[stage.period_ns for stage in self.role.stages])
         self._ahead_ns = max(stage.period_ns for stage in self.role.stages) - 1

@@ -145,7 +145,7 @@ class Replaying:
         self._recorded, self._plan, self._indices, self._tolerance = recorded, plan, indices, tolerance
         self._until_ns = min(recorded.whole_until_ns(), plan.duration_ns + 1)
         if self._until_ns <= 0:
-            raise UsageError("the recording lacks states of robots from the start: nothing can be replayed")
+            raise UsageError("the recording lacks messages from the start: nothing can be replayed")
         self._until_s = last_ns(plan, self._until_ns) / 1e9
         self._feeding = Feeding(plan, recorded, indices, self._until_ns)
 

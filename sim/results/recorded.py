@@ -22,7 +22,7 @@ class Series:
     source: int
     channel: Channel
     sequences: NDArray[np.int64]
-    """Sequence numbers, (n,).  The number of a null message is absent, since a recording holds no null messages"""
+    """Sequence numbers, (n,), without those of null messages"""
     times_ns: NDArray[np.int64]
     """Times of the messages [ns], (n,)"""
     values: Array
@@ -42,7 +42,9 @@ class Recorded:
 
     plan: Plan
     series: Mapping[tuple[int, Channel], Series]
-    """By source and channel; channels without a message are absent"""
+    """By source and channel; channels without a message with values are absent"""
+    nulls: Mapping[tuple[int, Channel], Mapping[int, int]]
+    """By source and channel, the numbers of null messages, with their times [ns]"""
     metadata: Mapping[str, str]
     """What the recorder wrote about the run: engine, clock, versions"""
     scenario: str
@@ -63,27 +65,29 @@ class Recorded:
     def whole_until_ns(self) -> int:
         """Returns the instant before which nothing is missing [ns]: one after the duration if the recording is whole.
 
-        In virtual time a robot sends a state in every period, so a missing state shows that something was not recorded.
-        From there on it is unknown which messages were null and which are missing.  On a wall clock a recorder may miss
-        messages, and a robot may fall silent; so there this is the end of the recording."""
+        In virtual time robots and nodes send a message in every period, so a number that is missing shows that something was
+        not recorded.  On a wall clock a recorder may miss messages, and a robot may fall silent; so there this is the end of
+        the recording."""
         if self.by_arrival:
             return min(self.plan.duration_ns, self.last_ns) + 1
-        robots = [(self.series.get((robot.index, Channel.STATE)), robot.period_ns) for robot in self.plan.robots]
-        ends_ns = [0 if series is None else _gap_ns(series, period_ns) for series, period_ns in robots]
-        if not self.cut and min(ends_ns) > self.plan.duration_ns:
-            return self.plan.duration_ns + 1
-        periods = {(link.source, link.channel): link.period_ns for link in self.plan.links}
-        ends_ns += [(int(each.sequences[-1]) + 1) * periods[key] for key, each in self.series.items() if key in periods]
-        return min(ends_ns)
+        formation = len(self.plan.formation)
+        periods_ns = {
+            (link.source, link.channel): link.period_ns for link in self.plan.links if link.source < formation
+        }
+        ends_ns = [self._first_missing(key) * period_ns for key, period_ns in periods_ns.items()]
+        return min(self.plan.duration_ns + 1, *ends_ns)
+
+    def _first_missing(self, key: tuple[int, Channel]) -> int:
+        """Returns the first number of a message that was not recorded."""
+        series = self.series.get(key)
+        numbers = np.array(sorted(self.nulls.get(key, ())), np.int64)
+        if series is not None:
+            numbers = np.union1d(numbers, series.sequences)
+        missing = np.flatnonzero(numbers != np.arange(len(numbers)))
+        return int(missing[0]) if len(missing) else len(numbers)
 
 
 def last_ns(plan: Plan, until_ns: int) -> int:
     """Returns the last instant of a plan's robots and nodes before `until_ns` [ns]."""
     tick_ns = gcd(*[one.period_ns for one in plan.formation])
     return (until_ns - 1) // tick_ns * tick_ns
-
-
-def _gap_ns(series: Series, period_ns: int) -> int:
-    """Returns the instant of the first message that a series lacks [ns]."""
-    missing = np.flatnonzero(series.sequences != np.arange(len(series.sequences)))
-    return int(missing[0] if len(missing) else len(series.sequences)) * period_ns

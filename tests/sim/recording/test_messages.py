@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from echelon.messages import Channel, Message
+from echelon.messages import NULL, Channel, Message
 from echelon.sim.recording import mcap_writer as chunked
 from echelon.sim.recording.messages import read_messages
 from echelon.sim.recording.recorder import Recorder
@@ -28,8 +28,11 @@ def test_all_messages_come_back_bit_for_bit(scenario: str, overrides: tuple[str,
     folder = record(tmp_path / "run", scenario, *overrides)
     plan = plan_of(scenario, "duration=0.4", "claims=[]", *overrides)
     expected: dict[tuple[int, Channel], list[Message]] = {}
+    nulls: dict[tuple[int, Channel], dict[int, int]] = {}
     for message in messages_of(plan):
-        if not message.is_null:
+        if message.is_null:
+            nulls.setdefault((message.source, message.channel), {})[message.sequence] = message.time_ns
+        else:
             expected.setdefault((message.source, message.channel), []).append(message)
     recorded = read_messages(folder / "run.mcap", plan)
     assert recorded.series.keys() == expected.keys()
@@ -38,6 +41,8 @@ def test_all_messages_come_back_bit_for_bit(scenario: str, overrides: tuple[str,
         assert series.sequences.tolist() == [message.sequence for message in expected[key]]
         assert series.times_ns.tolist() == [message.time_ns for message in expected[key]]
         assert series.values.tobytes() == b"".join(message.values.tobytes() for message in expected[key])
+    assert recorded.nulls == nulls
+    assert bool(nulls) == (LOSSY in overrides)
     assert not recorded.cut
     assert recorded.whole_until_ns() == plan.duration_ns + 1
     assert recorded.scenario == (folder / "scenario.toml").read_text()
@@ -105,6 +110,12 @@ def of_another_plan(path: Path) -> None:
         recorder.record(Message(Channel.GROUP_STATE, 9, 0, 0, np.ones(4)))
 
 
+def of_nobody(path: Path) -> None:
+    """Records a null message of a source that the plan of `lab` does not have."""
+    with closing(Recorder(path, plan_of("three_levels"), "", {})) as recorder:
+        recorder.record(Message(Channel.COMMAND, 30, 0, 0, NULL))
+
+
 def empty(path: Path) -> None:
     """Records nothing."""
     Recorder(path, plan_of("lab"), "", {}).close()
@@ -115,6 +126,7 @@ def empty(path: Path) -> None:
     [
         (twice, r"/run.mcap: /g1/r1/state has two messages number 0"),
         (of_another_plan, r"/run.mcap: a message of /g1/state has \d+ bytes, not \d+"),
+        (of_nobody, r"/run.mcap: /nulls names source 30 and channel 4, which are not of this plan"),
         (empty, r"/run.mcap: holds no messages between roles of this plan"),
         (lambda path: path.write_bytes(b"hello"), r"/run.mcap: is no MCAP file"),
     ],

@@ -212,6 +212,13 @@ def test_joint_state(time_ns: int, joints: list[str], data: st.DataObject) -> No
     assert encoded == serialized("sensor_msgs/JointState", message)
 
 
+@given(times, st.integers(0, 2**32 - 1), st.integers(0, 255), st.integers(0, 2**64 - 1))
+def test_null_message(time_ns: int, source: int, channel: int, sequence: int) -> None:
+    message = make("echelon_msgs/NullMessage", header(time_ns, ""), source, channel, sequence)
+    encoded = ros.null_message(ros.stamp(time_ns), source, channel, sequence)
+    assert encoded == serialized("echelon_msgs/NullMessage", message)
+
+
 singles = st.floats(0, 1, width=32)
 points = st.lists(st.tuples(numbers, numbers), max_size=3)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from echelon.errors import UsageError
-from echelon.messages import Channel, Message
+from echelon.messages import NULL, Channel, Message
 from echelon.sim.recorded_runs import replay_run
 from echelon.sim.replay.comparison import ChannelComparison
 from echelon.sim.replay.replay import Replay
@@ -91,11 +91,12 @@ def test_a_changed_state_is_found_with_the_leader_that_heard_it(tmp_path: Path) 
     assert replayed(tmp_path / "run", tolerance=1e-4).equal
 
 
-def test_a_message_that_was_not_recorded_is_computed_only(tmp_path: Path) -> None:
-    def drop(message: Message) -> Message | None:
-        return None if message[1:3] == (LEADER, 7) and message.channel is Channel.COMMAND else message
+def test_where_a_role_said_nothing_what_it_says_now_is_computed_only(tmp_path: Path) -> None:
+    def silent(message: Message) -> Message:
+        null = message[1:3] == (LEADER, 7) and message.channel is Channel.COMMAND
+        return message._replace(values=NULL) if null else message
 
-    found = replayed(record(tmp_path / "run", "lab", alter=drop))
+    found = replayed(record(tmp_path / "run", "lab", alter=silent))
     assert found.first_difference is not None
     assert (found.first_difference.member, found.first_difference.sequence, found.first_difference.lacking) == (
         "g1",
@@ -193,10 +194,9 @@ def test_a_tolerance_is_finite_and_not_negative(tolerance: float, tmp_path: Path
         replayed(record(tmp_path / "run", "lab"), tolerance=tolerance)
 
 
-def test_from_the_first_state_that_lacks_nothing_is_compared(tmp_path: Path) -> None:
-    folder = record(
-        tmp_path / "run", "lab", alter=lambda message: None if (message.source, message.sequence) == (4, 7) else message
-    )
+@pytest.mark.parametrize("source", [4, LEADER, ROOT])
+def test_from_the_first_message_that_lacks_nothing_is_compared(source: int, tmp_path: Path) -> None:
+    folder = record(tmp_path / "run", "lab", alter=lambda message: None if message[1:3] == (source, 7) else message)
     found = replayed(folder)
     assert found.equal
     assert found.until == pytest.approx(0.06)
@@ -204,7 +204,7 @@ def test_from_the_first_state_that_lacks_nothing_is_compared(tmp_path: Path) -> 
     nothing = record(
         tmp_path / "none", "lab", alter=lambda message: None if message.channel is Channel.STATE else message
     )
-    with pytest.raises(UsageError, match="lacks states of robots from the start"):
+    with pytest.raises(UsageError, match="lacks messages from the start"):
         replayed(nothing)
 
 

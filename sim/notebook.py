@@ -1,8 +1,8 @@
 """Functions for notebooks and scripts: `load`, `run` and `open_run`, with the same names of options as the command line."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import tomlkit
 
@@ -10,11 +10,15 @@ from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
-from echelon.shipped import scenario_path
+from echelon.shipped import EFFECTIVE, scenario_path
 from echelon.sim import run_folder
 from echelon.sim.finished_run import Run
 from echelon.sim.launch import Launch, launch
 from echelon.sim.parts import loading as parts
+
+if TYPE_CHECKING:
+    from echelon.sim.replay.difference import RunDifference
+    from echelon.sim.replay.replay import Replay
 
 
 class Loaded(NamedTuple):
@@ -89,6 +93,48 @@ def run(
 def open_run(folder: str | Path) -> Run:
     """Returns the run in a folder.  Raises UserError if it is not the folder of a run, or a file of it cannot be read."""
     return run_folder.open_run(Path(folder))
+
+
+def replay(
+    run: str | Path | Run,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    scenario: AnyScenario | None = None,
+    only: str | Sequence[str] = (),
+    tolerance: float = 0.0,
+) -> "Replay":
+    """Feeds the messages that a run recorded to today's roles, and compares what they say with what was recorded:
+    `replay("runs/demo", {"law.epsilon": [0.05, 0.1]}, only="coordinator").first_difference`.
+
+    `run` is the folder of a run, or a run that has one.  The roles are those of its own scenario with `changes`, or of
+    another `scenario` of the same tree.  `only` names robots, nodes or groups.  Values that differ by `tolerance` at most are
+    equal.  Raises UserError for what cannot be replayed."""
+    from echelon.sim.recorded_runs import open_recorded
+    from echelon.sim.recorded_runs import replay as replay_recorded
+
+    folder = _folder(run)
+    recorded = open_recorded(folder)
+    plan = load(folder / EFFECTIVE if scenario is None else scenario, changes).plan
+    return replay_recorded(recorded, plan, folder, [only] if isinstance(only, str) else only, tolerance)
+
+
+def diff(first: str | Path | Run, second: str | Path | Run, *, tolerance: float = 0.0) -> "RunDifference":
+    """Says where two runs part: `diff("runs/demo", "runs/again").first_difference` is the first instant, message and value.
+
+    Takes folders of runs, or runs that have one.  Values that differ by `tolerance` at most are equal.  Raises UserError for
+    what cannot be read."""
+    from echelon.sim.recorded_runs import diff_runs
+
+    return diff_runs(_folder(first), _folder(second), tolerance)
+
+
+def _folder(run: str | Path | Run) -> Path:
+    """Returns the folder of a run.  Raises UserError if it has none."""
+    if not isinstance(run, Run):
+        return Path(run)
+    if run.folder is None:
+        raise UserError("this run has no folder, so its messages were not recorded")
+    return run.folder
 
 
 def toml_value(value: Any) -> str:

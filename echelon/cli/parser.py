@@ -49,6 +49,12 @@ def _results() -> Commands:
     return COMMANDS
 
 
+def _recordings() -> Commands:
+    from echelon.cli.recordings import COMMANDS
+
+    return COMMANDS
+
+
 def _bus() -> Commands:
     from echelon.cli.bus import COMMANDS
 
@@ -83,6 +89,8 @@ ENTRIES: Final = {
     "report": Entry("write the report of a run, or a comparison of several", _results),
     "export": Entry("write a run's tables as CSV or Parquet", _results),
     "recover": Entry("rebuild what a killed run left, or mend a recording that was cut off", _results),
+    "replay": Entry("feed a run's messages to today's roles and say where their outputs differ", _recordings),
+    "diff": Entry("say where two runs part: the first instant, message and value", _recordings),
     "drives": Entry("run the virtual drives of a scenario alone, to try hosts on", _bus),
     "can": Entry("show what is on a scenario's CAN buses, wheel by wheel", _bus),
     "referee": Entry("say what breaks the contract on a scenario's CAN buses", _bus),

@@ -68,7 +68,7 @@ def read_trace(path: Path, plan: Plan) -> Trace:
 
     Raises ValueError if the file is cut off, damaged, not a recording, or a recording of another plan."""
     topics = [state_topic(robot.path) for robot in plan.robots]
-    with _blame(path):
+    with blame(path):
         times_ns, states = _by_robot(path, topics, "RobotState", ros.robot_state(), len(STATE_FIELDS))
         return Trace(plan, times_ns, states)
 
@@ -79,7 +79,7 @@ def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArra
 
     Raises ValueError if the file is cut off, damaged, not a recording, or a recording of another plan."""
     topics = [torque_topic(robot.path) for robot in plan.robots]
-    with _blame(path):
+    with blame(path):
         times_ns, torques = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), len(TORQUE_FIELDS))
         return list(zip(times_ns, torques, strict=True))
 
@@ -111,7 +111,7 @@ def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
 
     Raises ValueError if the file is cut off, damaged or not a recording."""
     found = []
-    with _blame(path):
+    with blame(path):
         for _, time_ns, data in _messages(path, {LINKS}, "echelon_msgs/LinkStatistics"):
             at = len(ros.stamp(0)) + 8  # the empty frame_id
             source, receiver, channel = _LINK.unpack_from(data, at)
@@ -122,8 +122,8 @@ def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
 
 def read_scenario(path: Path) -> str:
     """Returns the effective scenario as TOML, also from a file that is cut off.  Raises ValueError if the file has none."""
-    with _blame(path):
-        for record in _records(path):
+    with blame(path):
+        for record in records(path):
             if isinstance(record, Attachment) and record.name == SCENARIO:
                 return record.data.decode()
         raise ValueError(f"holds no {SCENARIO}")
@@ -131,8 +131,8 @@ def read_scenario(path: Path) -> str:
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Returns the recorder's metadata, also from a file that is cut off.  Raises ValueError if the file has none."""
-    with _blame(path):
-        for record in _records(path):
+    with blame(path):
+        for record in records(path):
             if isinstance(record, Metadata) and record.name == METADATA:
                 return record.metadata
         raise ValueError("holds no metadata of a run")
@@ -151,7 +151,7 @@ def recover(source: Path, target: Path) -> RecoverResult:
     `target` appears only when it is complete.  Raises ValueError if `source` is not an MCAP file, or is `target`, and OSError
     if `target` cannot be written."""
     partial = target.with_name(target.name + ".part")
-    with _blame(source):
+    with blame(source):
         if target.exists() and target.samefile(source):
             raise ValueError("cannot be mended in place; give another file to write to")
         try:
@@ -169,7 +169,7 @@ def _copy(source: Path, writer: Writer) -> RecoverResult:
     messages, until_ns, damaged, complete = 0, None, list[str](), True
     writer.start("ros2", "echelon")
     try:
-        for record in _records(source, damaged):
+        for record in records(source, damaged):
             if isinstance(record, Schema) and record.id not in schemas:
                 schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
             elif isinstance(record, Channel) and record.id not in channels and record.schema_id in schemas:
@@ -194,22 +194,26 @@ def _messages(path: Path, topics: "dict[str, int] | set[str]", kind: str) -> Ite
     """Yields topic, time [ns] and bytes of the messages on `topics`, whose type must be `kind`, for example
     `echelon_msgs/RobotState`.  Raises ValueError if the file has none of these topics, or their type is another one."""
     schemas, wanted = dict[int, Schema](), dict[int, str]()
-    for record in _records(path):
+    for record in records(path):
         if isinstance(record, Message):
             if record.channel_id in wanted:
                 yield wanted[record.channel_id], record.log_time, record.data
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel) and record.topic in topics:
-            schema = schemas.get(record.schema_id)
-            if schema is None or schema.name != schema_name(kind) or schema.data != schema_text(kind).encode():
-                raise ValueError(f"{record.topic} is not of the {schema_name(kind)} known here")
+            check_type(record.topic, schemas.get(record.schema_id), kind)
             wanted[record.id] = record.topic
     if not wanted:
         raise ValueError(f"holds no {schema_name(kind)} of this plan")
 
 
-def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:
+def check_type(topic: str, schema: Schema | None, kind: str) -> None:
+    """Raises ValueError unless messages of this schema are of the type `kind` as it is known here."""
+    if schema is None or schema.name != schema_name(kind) or schema.data != schema_text(kind).encode():
+        raise ValueError(f"{topic} is not of the {schema_name(kind)} known here")
+
+
+def records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:
     """Yields schemas, channels, messages, attachments and metadata in the order of the file.
 
     Raises ValueError for a damaged record, unless `damaged` is given: then the record is skipped, and its error added to
@@ -276,7 +280,7 @@ def _message(body: bytes) -> Message:
 
 
 @contextmanager
-def _blame(path: Path) -> Iterator[None]:
+def blame(path: Path) -> Iterator[None]:
     """A context in which errors about the content of a file become ValueError of one line that begins with the file's path."""
     try:
         yield

@@ -22,6 +22,8 @@ SCENARIO: Final = "scenario.toml"
 """The name of the attachment that holds the effective scenario."""
 FRAMES, LINKS = "/can/frames", "/links"
 """Topics of frames and of counts of links.  With several buses, the topics of frames have their names: `/can/can1/frames`."""
+NULLS: Final = "/nulls"
+"""Topic of null messages: which source sent one, on which channel, and its number"""
 
 
 class Recorder:
@@ -40,17 +42,17 @@ class Recorder:
 
         The scenario and the texts `part_files` (by name) become attachments; `metadata`, such as versions, become metadata."""
         self.null_messages = 0
-        """Number of null messages; they are not written."""
+        """Number of null messages"""
         self._plan = plan
         self._scene = Scene(plan)
-        topics, routes = _routes(plan)
+        topics, known = routes(plan)
         topics |= self._scene.topics | {DESIRED: "visualization_msgs/MarkerArray"}
         self._frame_topics = frame_topics(plan)
         topics |= dict.fromkeys(self._frame_topics, "can_msgs/Frame")
-        topics |= {LINKS: "echelon_msgs/LinkStatistics"}
+        topics |= {LINKS: "echelon_msgs/LinkStatistics", NULLS: "echelon_msgs/NullMessage"}
         self._numbers = {topic: number for number, topic in enumerate(topics, 1)}
         self._routes = {
-            key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in routes.items()
+            key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in known.items()
         }
         attachments = {name: text.encode() for name, text in {SCENARIO: scenario_toml, **part_files}.items()}
         self._file = ChunkedFile(path, attachments, metadata, topics)
@@ -69,14 +71,16 @@ class Recorder:
     def record(self, message: Message) -> None:
         """Writes a message.  Raises ValueError if it has not the number of values that its channel has in the plan."""
         raw = message.values.tobytes()
-        if not raw:
-            self.null_messages += 1
-            return
+        self.null_messages += not raw
         if self._file.failure is not None:
             return
         if message.time_ns != self._now:
             self._advance(message.time_ns)
         source, channel = message.source, message.channel
+        if not raw:
+            null = ros.null_message(self._head, source, channel, message.sequence)
+            self._file.add(self._numbers[NULLS], self.null_messages - 1, self._now, null)
+            return
         number, size, encode = self._routes[16 * source + channel]
         if len(raw) != size:
             name = self._plan.all_roles[source].name
@@ -130,14 +134,14 @@ class Recorder:
         self._next_display = (self._now // period + 1) * period
 
 
-def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
+def routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
     """Returns the types of all topics by topic, and the topic and encoder of each kind of message by 16 * source + channel."""
     topics: dict[str, str] = {}
-    routes: dict[int, tuple[str, ros.Splice]] = {}
+    found: dict[int, tuple[str, ros.Splice]] = {}
 
     def add(channel: Channel, source: int, topic: str, kind: str, splice: ros.Splice) -> None:
         topics[topic] = f"echelon_msgs/{kind}"
-        routes[16 * source + channel] = (topic, splice)
+        found[16 * source + channel] = (topic, splice)
 
     if plan.bridge is not None:
         for robot in plan.robots:
@@ -157,7 +161,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
             add(Channel.REFERENCE, node.index, prefix + "reference", "Reference", encoder)
         if (command := layout.command) is not None:
             add(Channel.COMMAND, node.index, prefix + "command", "Command", ros.command(length(command.accelerations)))
-    return topics, routes
+    return topics, found
 
 
 def frame_topics(plan: Plan) -> list[str]:

@@ -121,6 +121,22 @@ class Splice:
             message += constant + values[start:end]
         return message
 
+    def decode(self, message: bytes) -> bytes:
+        """Returns the values of a message that `encode` made.  Raises ValueError if its size or a constant part is another."""
+        at = len(stamp(0)) + len(self._first)
+        size = at + self.size + sum(len(constant) for constant, _, _ in self._rest)
+        if len(message) != size:
+            raise ValueError(f"has {len(message)} bytes, not {size}")
+        values = message[at : at + self._end]
+        at += self._end
+        for constant, start, end in self._rest:
+            if message[at : at + len(constant)] != constant:
+                raise ValueError("has an array of another length")
+            at += len(constant)
+            values += message[at : at + end - start]
+            at += end - start
+        return values
+
 
 def robot_state() -> Splice:
     """Returns the encoder of echelon_msgs/RobotState; its values are `STATE_FIELDS`."""
@@ -219,6 +235,16 @@ def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> by
     if len(data) > 8:
         raise ValueError(f"CAN frame {can_id:#x} holds {len(data)} bytes; can_msgs/Frame takes at most 8")
     return head + _FRAME.pack(1, can_id, remote, can_id > 0x7FF, False, len(data), data)
+
+
+NULL_MESSAGE: Final = struct.Struct("<I4xIB3xQ")
+"""Of an echelon_msgs/NullMessage what follows the stamp: an empty frame_id, padded to a multiple of four; source, channel,
+sequence number"""
+
+
+def null_message(head: bytes, source: int, channel: int, sequence: int) -> bytes:
+    """Returns an echelon_msgs/NullMessage.  `head` is from `stamp`."""
+    return head + NULL_MESSAGE.pack(1, source, channel, sequence)
 
 
 def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:

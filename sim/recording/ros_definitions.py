@@ -49,6 +49,7 @@ DEFINITIONS: Final = {
     "echelon_msgs/Command": _HEADER + "float64[] accelerations\n",
     "echelon_msgs/WheelTorque": _HEADER + "".join(f"float64 {name}\n" for name in TORQUE_FIELDS),
     "echelon_msgs/Wheels": _HEADER + "float64[] torques\n",
+    "echelon_msgs/NullMessage": _HEADER + "uint32 source\nuint8 channel\nuint64 sequence\n",
     "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
     "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
     "float64 age_mean_ns\nint64 age_max_ns\n",

@@ -19,9 +19,14 @@ def differences(scenarios: Sequence[str], summaries: Sequence[Summary]) -> list[
 
     `scenarios` are the effective scenarios (TOML), `summaries` those of the same runs.  A key of a scenario is written as
     `--set` takes it and as messages write it: `links.0.delay`.  `run: engine` and the like say how a run was made."""
+    return differing(scenarios, [{key: str(getattr(summary.run, key)) for key in RUN_KEYS} for summary in summaries])
+
+
+def differing(scenarios: Sequence[str], facts: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Does the same with any `facts` about how the runs were made, by name."""
     tables = [dict(_flat(tomllib.loads(scenario))) for scenario in scenarios]
-    for table, summary in zip(tables, summaries, strict=True):
-        table |= {f"run: {key}": str(getattr(summary.run, key)) for key in RUN_KEYS}
+    for table, each in zip(tables, facts, strict=True):
+        table |= {f"run: {key}": value for key, value in each.items()}
     keys = dict.fromkeys(key for table in tables for key in table)
     rows = [[key, *(table.get(key, ABSENT) for table in tables)] for key in keys]
     return [row for row in rows if len(set(row[1:])) > 1]

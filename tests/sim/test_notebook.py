@@ -236,3 +236,39 @@ def test_an_engine_or_a_clock_that_does_not_exist_is_refused(wrong: dict[str, st
     with pytest.raises(echelon.UserError, match=f"{name} = '{value}': must be "):
         echelon.run("lab", out=tmp_path / "run", quiet=True, **wrong)  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
+
+
+# What was recorded, judged again
+
+
+def test_a_run_is_replayed_with_another_law(lab: echelon.Run) -> None:
+    assert echelon.replay(lab).equal
+    found = echelon.replay(lab, {"law.epsilon": [0.3, 0.6]}, only="coordinator")
+    assert not found.equal
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.roles) == (
+        0.0,
+        "coordinator",
+        ("coordinator",),
+    )
+    other = echelon.load("lab", {**SHORT, "law.epsilon": [0.3, 0.6]})
+    assert echelon.replay(str(lab.folder), scenario=other, only=["coordinator"]).channels == found.channels
+    assert echelon.replay(lab, {"law.epsilon": [0.3, 0.6]}, only="coordinator", tolerance=1e6).equal
+
+
+def test_two_runs_are_compared(lab: echelon.Run, tmp_path: Path) -> None:
+    changed = echelon.run("lab", SHORT | {"law.lead": 0.0}, engine="inprocess", out=tmp_path, quiet=True)
+    assert lab.folder is not None
+    assert echelon.diff(lab, lab.folder).equal
+    found = echelon.diff(lab, changed)
+    assert found.first_difference is not None
+    assert (found.first_difference.member, found.first_difference.time) == ("coordinator", 0.0)
+    assert found.scenario == {"law.lead": ("0.5", "0.0")}
+    assert echelon.diff(lab, changed, tolerance=1e6).equal
+
+
+def test_what_has_no_folder_was_not_recorded() -> None:
+    simulation = echelon.Simulation("lab", SHORT)
+    simulation.run_until(0.05)
+    with pytest.raises(echelon.UserError, match="this run has no folder, so its messages were not recorded"):
+        echelon.replay(simulation.result())

@@ -19,18 +19,18 @@ class KeptParts:
     """What is kept of the files that a scenario names."""
 
     names: dict[Source, str]
-    """What each file is called in the folder"""
+    """The name of each file in the folder"""
     results: tuple[PartResult, ...]
     """The parts that are not built in, for the summary"""
 
     @property
     def files(self) -> dict[str, str]:
-        """The texts of the files by their names in the folder."""
+        """The texts of the files, by their names in the folder."""
         return {name: source.text for source, name in self.names.items()}
 
     @property
     def metadata(self) -> dict[str, str]:
-        """The hashes of the files, for the recording."""
+        """The SHA-256 of each file, for the metadata of the recording."""
         return {f"sha256 of {name}": source.sha256 for source, name in self.names.items()}
 
 
@@ -56,7 +56,9 @@ def keep_parts(scenario: Scenario, folder: Path, reserved: Iterable[str] = ()) -
 
 
 def _copied(source: Source, folder: Path, taken: set[str]) -> str:
-    """Puts a file into a folder; returns what it is called there."""
+    """Copies a file into a folder, unless the same text is there already; returns its name there.
+
+    `taken` are the names of other parts' files."""
     data, path = source.text.encode(), Path(source.name)
     count = 1
     while True:

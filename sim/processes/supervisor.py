@@ -15,7 +15,7 @@ over the loopback, at an address and ports of this run alone.
 
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -30,6 +30,7 @@ from echelon.sim.processes.to_process import End, Finish, Start, Told
 from echelon.sim.processes.to_supervisor import (
     Done,
     Failed,
+    LinksProgress,
     PartFailed,
     Ready,
     RecorderProgress,
@@ -64,8 +65,14 @@ class Progress:
     started_s: float = 0.0
     bridge: BridgeProgress = field(default_factory=BridgeProgress)
     drives: BridgeProgress = field(default_factory=BridgeProgress)
+    links: dict[tuple[int, int, int], LinkCounts] = field(default_factory=dict)
+    """The last counts of links, by receiver, source and channel"""
     note: str = ""
     """News for the user, for example which process everyone waits for"""
+
+    def hear_links(self, links: Iterable[LinkCounts]) -> None:
+        """Takes over counts of links."""
+        self.links |= {(each.receiver, each.source, each.channel): each for each in links}
 
     def hear(self, recorder: RecorderProgress) -> None:
         """Takes over the progress of the recorder."""
@@ -248,6 +255,8 @@ class Supervisor:
                 child.ready = True
             case Waiting():
                 child.waiting_ns, child.waiting_for = said.time_ns, list(said.sources)
+            case LinksProgress():
+                progress.hear_links(said.links)
             case BridgeProgress() if child.spec.kind == "bridge":
                 progress.bridge = said
             case BridgeProgress():

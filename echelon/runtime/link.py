@@ -111,16 +111,16 @@ class Link:
             self._newest = newest = (time_ns - self._first_ns) // self._period_ns
             return newest
         while self._due_ns <= time_ns:
-            arrivals = sorted(self._due_ns + delay for delay in self._fates.of(self._sent, self._due_ns))
-            if not arrivals:
+            copies = self._fates.of(self._sent, self._due_ns)
+            if not copies:
                 self._lost += 1
             else:
+                arrival = self._due_ns + (copies[0] if len(copies) == 1 else min(copies))
                 if self.plan.fifo:
-                    arrivals = [max(arrival, self._latest_ns) for arrival in arrivals]
-                    self._latest_ns = arrivals[0]
-                heappush(self._flying, (arrivals[0], self._sent))
-                for arrival in arrivals[1:]:
-                    heappush(self._copies, arrival)
+                    self._latest_ns = arrival = max(arrival, self._latest_ns)
+                heappush(self._flying, (arrival, self._sent))
+                if len(copies) > 1:
+                    heappush(self._copies, max(arrival, self._due_ns + max(copies)))
             self._sent += 1
             self._due_ns += self._period_ns
         while self._flying and self._flying[0][0] <= time_ns:

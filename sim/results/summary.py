@@ -1,4 +1,4 @@
-"""The summary of a run, and its plain-text rendering."""
+"""The summary of a run, and the summary as lines for a terminal."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,9 +8,10 @@ from echelon.bridge.reports import CanReport
 from echelon.runtime.link import LinkCounts
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.can_lines import can_lines
-from echelon.sim.results.checks import Evidence, verdict
+from echelon.sim.results.checks import verdict
 from echelon.sim.results.distances import distances
 from echelon.sim.results.ending import endings
+from echelon.sim.results.evidence import Evidence
 from echelon.sim.results.measures import (
     block_result,
     claim_results,
@@ -19,7 +20,7 @@ from echelon.sim.results.measures import (
     separation_results,
     torque_result,
 )
-from echelon.sim.results.records import FORMAT, PartResult, RunFacts, Summary
+from echelon.sim.results.records import FORMAT, LinkResult, PartResult, RunFacts, Summary
 from echelon.sim.results.trace import Trace
 
 
@@ -30,7 +31,9 @@ def summarise(
     run: RunFacts,
     parts: tuple[PartResult, ...] = (),
 ) -> Summary:
-    """Returns what a run showed.  Nothing is raised for one that diverged, broke off or never began: its verdict says so."""
+    """Returns the summary of a run.  A run that diverged, broke off or never began raises nothing: its verdict says so.
+
+    `can` is None if the run had no bus; `parts` are the parts that are not built in."""
     plan = trace.plan
     blocks = block_series(trace)
     near = distances(trace)
@@ -65,7 +68,7 @@ def summarise(
 
 
 def summary_text(summary: Summary) -> str:
-    """Returns a summary as plain lines for a terminal."""
+    """Returns a summary as lines for a terminal."""
     return "\n".join(_lines(summary))
 
 
@@ -94,17 +97,9 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
     if summary.links:
         sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
-        used = [link for link in summary.links if link.age_max is not None and link.age_p99 is not None]
-        oldest = (
-            f"oldest in use {number(max(link.age_max or 0.0 for link in used), 's')}"
-            if used
-            else "nothing was ever used"
-        )
-        if any(link.age_p99 != link.age_max for link in used):
-            worst = max(used, key=lambda link: link.age_p99 or 0.0)
-            oldest += f"; 99 % of uses up to {number(worst.age_p99, 's')} ({worst.source} → {worst.receiver})"
         twice = sum(link.duplicates for link in summary.links)
-        yield f"  links    {sent} messages, {lost} lost{f', {twice} twice' if twice else ''}, {oldest}"
+        counts = f"{sent} messages, {lost} lost{f', {twice} twice' if twice else ''}"
+        yield f"  links    {counts}, {_ages(summary.links)}"
     yield from can_lines(summary.can)
     run = summary.run
     if run.clock == "wall" and run.stages:
@@ -114,8 +109,19 @@ def _lines(summary: Summary) -> Iterator[str]:
     yield f"  digest   {summary.trace_digest}"
 
 
+def _ages(links: Sequence[LinkResult]) -> str:
+    """Returns the largest age, and of the link on which it is largest the age that 99 % of the uses do not exceed."""
+    ages = [(link.age_p99, link.age_max, f"{link.source} → {link.receiver}") for link in links]
+    used = [(p99, largest, name) for p99, largest, name in ages if p99 is not None and largest is not None]
+    if not used:
+        return "no message was used"
+    oldest = f"oldest in use {number(max(largest for _, largest, _ in used), 's')}"
+    p99, _, name = max(used)
+    return f"{oldest}; 99 % of uses up to {number(p99, 's')} ({name})" if any(p < q for p, q, _ in used) else oldest
+
+
 def number(value: float | None, unit: str = "", missing: str = "–") -> str:
-    """Returns a number for people, four digits and its unit, or `missing`."""
+    """Returns a number with four digits and its unit, or `missing` for None."""
     if value is None:
         return missing
     return f"{value:.4g} {unit}".rstrip()

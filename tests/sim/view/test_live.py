@@ -13,7 +13,7 @@ from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS, Channel
 from echelon.runtime.link import LinkCounts
-from echelon.sim.processes.supervisor import Progress
+from echelon.sim.processes.outcome import Progress
 from echelon.sim.view import live
 from echelon.sim.view.live import Display
 from support.runs import plan_of

@@ -71,7 +71,7 @@ class Plugin(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The Python file that a part comes from."""
+    """A file that a scenario names: the Python file of a part, or a trace of delays."""
 
     name: str
     """The path as the scenario gives it, relative to the scenario's folder"""
@@ -213,7 +213,7 @@ def allowed(names: list[str]) -> str:
 
 
 def read_source(name: str, folder: Path) -> Source:
-    """Returns the text of a Python file in `folder`.  Raises PartError if it cannot be read, or is not UTF-8."""
+    """Returns the text of a file in `folder`.  Raises PartError if it cannot be read, or is not UTF-8."""
     path = folder / name
     try:
         return Source(name, path.read_bytes().decode())

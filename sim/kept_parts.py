@@ -1,7 +1,5 @@
-"""The files that a scenario names, kept in a run's folder: parts that others wrote, and traces of delays.
-
-So the scenario.toml of the folder runs again there, wherever the files came from.
-"""
+"""Copies the files that a scenario names (users' parts, traces of delays) into a run's folder, so that its scenario.toml can be
+run again from there."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from echelon.sim.results.records import PartResult
 
 @dataclass(frozen=True, slots=True)
 class KeptParts:
-    """What is kept of the files that a scenario names."""
+    """The files that a scenario names, as a run's folder keeps them."""
 
     names: dict[Source, str]
     """The name of each file in the folder"""
@@ -35,10 +33,9 @@ class KeptParts:
 
 
 def keep_parts(scenario: Scenario, folder: Path, reserved: Iterable[str] = ()) -> KeptParts:
-    """Copies the files that a scenario names into a folder; returns what they are called there.  Raises OSError.
+    """Copies the files that a scenario names into a folder; returns their names there.  Raises OSError.
 
-    A file keeps its name unless another one of them, or another file that is there already, has it, or it is `reserved`:
-    nothing is overwritten."""
+    Nothing is overwritten: if another file has the name already, or it is `reserved`, a number is added (`law-2.py`)."""
     names: dict[Source, str] = {}
     results: dict[str, PartResult] = {}
     for part in parts_in(scenario):
@@ -58,7 +55,7 @@ def keep_parts(scenario: Scenario, folder: Path, reserved: Iterable[str] = ()) -
 def _copied(source: Source, folder: Path, taken: set[str]) -> str:
     """Copies a file into a folder, unless the same text is there already; returns its name there.
 
-    `taken` are the names of other parts' files."""
+    `taken` are names that it cannot have."""
     data, path = source.text.encode(), Path(source.name)
     count = 1
     while True:

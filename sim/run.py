@@ -169,6 +169,7 @@ def _in_process(
                     shown_s = now_s
                     progress.hear(recording.progress())
                     progress.bridge = bridge.progress()
+                    progress.hear_links(engine.link_counts())
                     recording.recorder.flush_if_due(time.monotonic_ns())
                     display.show(progress)
                 if recording.recorder.failure:

@@ -52,7 +52,7 @@ class Loop:
 
 
 def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
-    """Returns the links that are no part of a linear map: their messages are lost at times, or take different times."""
+    """Returns the links that a linear map cannot describe: they lose messages, or their delays vary."""
     return tuple(link for link in plan.links if not link.steady)
 
 

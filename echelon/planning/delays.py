@@ -140,7 +140,7 @@ def read_trace(trace: Trace, key: str) -> DelayTrace:
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
     """Yields the lines of a trace that are not empty and no remarks: the number of the line, and its values."""
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):
         if said := line.partition("#")[0].strip():
             yield number, [cell.strip() for cell in said.replace(";", ",").split(",")]
 

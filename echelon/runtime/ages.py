@@ -29,14 +29,20 @@ class AgeCounts:
 
     def note(self, age_ns: int) -> None:
         """Counts an age."""
-        counts = self._counts
         if not self._exact:
             age_ns = _rough(age_ns)
-        counts[age_ns] = counts.get(age_ns, 0) + 1
-        if self._exact and len(counts) > EXACT:
-            self._exact, self._counts = False, {}
-            for each, count in counts.items():
-                self._counts[_rough(each)] = self._counts.get(_rough(each), 0) + count
+        try:
+            self._counts[age_ns] += 1
+        except KeyError:
+            self._counts[age_ns] = 1
+            if self._exact and len(self._counts) > EXACT:
+                self._make_rough()
+
+    def _make_rough(self) -> None:
+        """Counts the ages from now on by their leading bits."""
+        self._exact, counts, self._counts = False, self._counts, {}
+        for each, count in counts.items():
+            self._counts[_rough(each)] = self._counts.get(_rough(each), 0) + count
 
     def percentiles(self, shares: Sequence[float], zeros: int) -> list[int]:
         """Returns for each share, ascending, the smallest age that is not exceeded in at least this share of the uses [ns].

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from echelon.plugins import Source
+from echelon.plugins import Source, read_source
 from echelon.scenario.part_fields import PartContext
 from echelon.scenario.values import (
     Finite,
@@ -102,21 +102,13 @@ class Pareto(Table):
 
 
 def _read(value: Any, info: ValidationInfo) -> Source:
-    """Returns the file that a scenario names, with its text.  Raises ValueError."""
+    """Returns the file that a scenario names, with its text.  Raises PartError or ValueError."""
     if isinstance(value, Source):
         return value
     if not isinstance(value, str):
         raise ValueError("must be the name of a file, relative to the scenario")
     context: PartContext | None = info.context
-    path = (context.folder if context else Path()) / value
-    try:
-        return Source(value, path.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{value!r} is not UTF-8 text (byte {error.start})") from None
-    except OSError as error:
-        raise ValueError(f"{value!r}: {error.strerror}") from None
-    except ValueError as error:  # a path with a zero byte
-        raise ValueError(f"{value!r}: {error}") from None
+    return read_source(value, context.folder if context else Path())
 
 
 def _written(source: Source, info: SerializationInfo) -> str:

@@ -43,6 +43,8 @@ HEAD: Final = """\
 All keys of a scenario, made from their source by `make docs`.  `echelon schema scenario` prints the same as a JSON schema
 for editors, `echelon validate FILE` checks a file, and `echelon new NAME` writes one to begin with.
 
+Rules of links, with examples: [links.md](links.md).
+
 A part of your own (a law, a plant, a trajectory, a drive protocol) is a class in a Python file beside the scenario:
 `trajectory = { use = "my_paths.py:Eight", parameters = { … } }` ([how to](add-a-law.md)).
 

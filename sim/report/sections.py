@@ -197,8 +197,8 @@ def can(one: ShownRun) -> str:
 def link_table(one: ShownRun) -> str:
     """Returns the table of links."""
     links = one.run.summary.links
-    head = ["link", "channel", "sent", "lost", "in flight", "twice", "held"]
-    head += ["mean age [s]", "p50", "p95", "p99", "largest"]
+    counted = ["sent", "lost", "in flight", "twice", "held"]
+    head = ["link", "channel", *counted, "mean age [s]", "p50", "p95", "p99", "largest"]
     rows = [
         [
             f"{row.source} → {row.receiver}",

@@ -21,6 +21,7 @@ from echelon.controller.prediction.linear_run import LinearRun, later, ruled_lin
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.controller.trajectory import Line
 from echelon.messages import Channel
+from echelon.plan.delay_tables import DelayTrace
 from echelon.plan.plan import Array, Plan
 from echelon.plan.punctuality import with_punctuality
 from echelon.plugins import Part
@@ -363,7 +364,7 @@ def test_a_timeout_ends_what_may_be_later():
 
 def test_what_has_no_answer_is_refused():
     plan = plan_of(scenario(PAPER_TREE, np.random.default_rng(1)))
-    for changed in ({"loss": 0.1}, {"delay_max_ns": 1_000_000}):
+    for changed in ({"loss": 0.1}, {"delay_max_ns": 1_000_000}, {"delays": DelayTrace((5, 6)), "delay_max_ns": 6}):
         links = (replace(plan.links[0], **changed), *plan.links[1:])
         with pytest.raises(PredictionError, match="1 of 24 links lose messages or have delays that vary"):
             LinearRun(replace(plan, links=links))

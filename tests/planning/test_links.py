@@ -15,7 +15,7 @@ from support.runs import SCENARIOS
 
 LAB = SCENARIOS / "lab.toml"
 FILES = {
-    "good.txt": "# measured\n0.010\n\nlost\n0.0205  # late\n",
+    "good.txt": "\ufeff# measured\n0.010\n\nlost\n0.0205  # late\n",
     "times.csv": "time,delay\n-1, 0.1\n0.5; 0.2\n2,lost\n",
     "headless.csv": "0,0.1\n1,0.2\n",
     "columns.csv": "seq, Delay\n7,0.1\n8,0.2\n",
@@ -91,9 +91,9 @@ def test_traces(folder: Path, delay: str, expected: DelayTrace) -> None:
             ".file = 'back.csv': line 4: time 1 must be later than that of the line before",
         ),
         ("{file='good.txt',by='time'}", ".file = 'good.txt': by = 'time' needs a column called time"),
-        ("{file='none.txt'}", ".file: 'none.txt': No such file or directory"),
-        ("{file='.'}", ".file: '.': Is a directory"),
-        ("{file='binary.txt'}", ".file: 'binary.txt' is not UTF-8 text (byte 4)"),
+        ("{file='none.txt'}", ".file: FOLDER/none.txt: No such file or directory"),
+        ("{file='.'}", ".file: FOLDER: Is a directory"),
+        ("{file='binary.txt'}", ".file: FOLDER/binary.txt: is not UTF-8 text"),
         ("{file=3}", ".file: must be the name of a file, relative to the scenario"),
         ("{by='time'}", ".file: missing"),
         ("{file='good.txt',by='line'}", ".by = 'line': must be one of 'message', 'time'"),
@@ -104,7 +104,7 @@ def test_mistakes_in_traces_name_their_line(folder: Path, delay: str, line: str)
     with pytest.raises(ScenarioError) as caught:
         plan_of(folder, f"links=[{{delay={delay}}}]")
     (said,) = caught.value.lines
-    assert f": links.0.delay{line}" in said
+    assert f": links.0.delay{line.replace('FOLDER', str(folder))}" in said
 
 
 @pytest.mark.parametrize(

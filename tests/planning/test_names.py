@@ -8,7 +8,7 @@ import pytest
 
 from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
-from echelon.sim.recording.mcap_reader import records, read_trace
+from echelon.sim.recording.mcap_reader import read_trace, records
 from echelon.sim.recording.recorder import frame_topics
 from support.runs import echelon, plan_of, summary_of
 

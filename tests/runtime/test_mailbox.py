@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from echelon.messages import NULL, Channel, Message
 from echelon.plan.can_plan import NEVER_NS
+from echelon.plan.delay_tables import ClockPlan
 from echelon.plan.plan import LinkPlan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.mailbox import Mailbox, WallMailbox
@@ -374,3 +375,47 @@ def test_event_driven_acts_do_not_depend_on_the_order_of_arrival(links, seed, sh
         expected = act_of(early, time_ns)
         assert act_of(late, time_ns) == expected
         assert time_ns <= expected[0] < time_ns + PERIOD
+
+
+def heard_at(link: LinkPlan, sent: Sequence[int], ticks: int) -> list[list[float] | None]:
+    """Returns what a stage hears at each tick, if only the messages with the numbers `sent` come."""
+    mailbox = mailbox_of([link])
+    found: list[list[float] | None] = []
+    for number in range(ticks):
+        if number in sent:
+            mailbox.deliver(message_of(link, number))
+        (heard,) = mailbox.take(0, number * PERIOD)
+        found.append(None if heard is None else heard.values.tolist())
+    return found
+
+
+def test_a_message_that_is_too_old_counts_as_nothing_or_as_zeros():
+    link = LinkPlan(3, RECEIVER, Channel.COMMAND, PERIOD, timeout_ns=PERIOD, policy="hold_then_stop")
+    comes, old, zeros = [3.0, 1.0], None, [0.0, 0.0]
+    assert heard_at(link, [1, 5], 7) == [None, comes, comes, old, old, [3.0, 5.0], [3.0, 5.0]]
+    zero = replace(link, policy="zero")
+    assert heard_at(zero, [1, 5], 7) == [None, comes, comes, zeros, zeros, [3.0, 5.0], [3.0, 5.0]]
+
+
+def test_zeros_are_no_use_of_a_message():
+    link = LinkPlan(3, RECEIVER, Channel.COMMAND, PERIOD, timeout_ns=PERIOD, policy="zero")
+    mailbox = mailbox_of([link])
+    mailbox.deliver(message_of(link, 0))
+    for tick in range(10):
+        mailbox.take(0, tick * PERIOD)
+    (counts,) = mailbox.counts()
+    assert (counts.used, counts.age_max_ns) == (2, PERIOD)
+
+
+def test_timeouts_are_read_off_the_clocks():
+    """A receiver whose clock is ahead takes messages for older than they are; with such a source they seem younger."""
+    link = LinkPlan(3, RECEIVER, Channel.STATE, PERIOD, timeout_ns=3 * PERIOD, policy="hold_then_stop")
+    for source, receiver, ticks in [
+        (ClockPlan(), ClockPlan(), 4),
+        (ClockPlan(), ClockPlan(2 * PERIOD), 2),
+        (ClockPlan(2 * PERIOD), ClockPlan(), 6),
+        (ClockPlan(2 * PERIOD), ClockPlan(2 * PERIOD), 4),
+        (ClockPlan(), ClockPlan(0, 1.0), 2),
+    ]:
+        plan = replace(link, source_clock=source, receiver_clock=receiver)
+        assert sum(heard is not None for heard in heard_at(plan, [0], 10)) == ticks

@@ -113,6 +113,17 @@ def test_links_of_every_kind_do_the_same_between_processes(tmp_path: Path) -> No
     assert sum(link.duplicates for link in of_channel[Channel.COMMAND])
 
 
+def test_links_are_told_while_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of("lab", "duration=4.0", 'links=[{channel="state",loss=0.5}]')
+    seen: list[int] = []
+    outcome = supervised(
+        plan, tmp_path, show=lambda progress: seen.append(sum(each.sent for each in progress.links.values()))
+    )
+    assert outcome.failure is None
+    assert seen[-1] <= sum(link.sent for link in outcome.links)
+    assert max(seen) > 0
+
+
 def test_order_of_start_does_not_matter(tmp_path: Path) -> None:
     plan = plan_of("paper", SHORT, LINKS)
     outcome = supervised(plan, tmp_path, order=lambda specs: specs[::-1])

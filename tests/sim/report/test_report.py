@@ -273,10 +273,11 @@ def test_runs_that_went_wrong_are_drawn_as_far_as_they_go(run, tmp_path):
 
 def test_a_link_over_which_nothing_was_used_has_no_ages(run, tmp_path):
     one = for_report(run, "run")
-    unused = replace(one.summary.links[0], used=0, age_mean=None, age_max=None)
+    none = dict.fromkeys(("age_mean", "age_p50", "age_p95", "age_p99", "age_max"))
+    unused = replace(one.summary.links[0], used=0, **none)
     page = rendered([replace(one, summary=replace(one.summary, links=(unused,)))], tmp_path / "report.html")
-    counts = f"{unused.sent} {unused.lost} {unused.in_flight} {unused.held}"
-    assert f"{unused.source} → {unused.receiver} {unused.channel} {counts} – –" in page.text
+    counts = f"{unused.sent} {unused.lost} {unused.in_flight} {unused.duplicates} {unused.held}"
+    assert f"{unused.source} → {unused.receiver} {unused.channel} {counts} – – – – –" in page.text
 
 
 def test_a_report_needs_a_run(tmp_path):

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from echelon.errors import Mistakes
+from echelon.part_groups import Registry
 from echelon.plan.can_plan import CanPlan
 from echelon.plan.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.planning import shapes
 from echelon.planning.drives import DriveMaker, make_can
-from echelon.plugins import Part, Registry
+from echelon.plugins import Part
 from echelon.scenario.can_tables import DriveTable
 from echelon.scenario.tables import Group, RobotTable, Scenario, Shape
 from echelon.scenario.values import Table

@@ -14,6 +14,7 @@ import numpy as np
 
 from echelon.errors import Mistakes
 from echelon.messages import Channel
+from echelon.part_groups import Registry
 from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan, EventPlan
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import (
@@ -31,7 +32,6 @@ from echelon.plan.plan import (
 from echelon.planning.blocks import fitting, make_blocks, make_coupling
 from echelon.planning.drives import make_events
 from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
-from echelon.plugins import Registry
 from echelon.scenario.tables import Law, LinkRule, Scenario, Uniform
 from echelon.scenario.values import path_matches
 

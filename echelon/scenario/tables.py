@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
 
+from echelon.parameters import Finite, NonNegative, Point, Positive
 from echelon.scenario.can_tables import Can, DriveTable, EnvelopeTable, Event
 from echelon.scenario.part_fields import (
     LawName,
@@ -20,15 +21,11 @@ from echelon.scenario.part_fields import (
 )
 from echelon.scenario.values import (
     CouplingGain,
-    Finite,
     Flag,
     Fraction,
     Gain,
     Limit,
     Name,
-    NonNegative,
-    Point,
-    Positive,
     Seconds,
     Table,
     alike,

@@ -59,7 +59,7 @@ class LinkCounts:
 
 
 class Link:
-    """One directed link with its state.  `newest` must be called with ascending instants."""
+    """One directed link with its state.  `newest` must be called with ascending instants; `latest` is its last answer."""
 
     __slots__ = (
         "_age_max",
@@ -75,10 +75,10 @@ class Link:
         "_key",
         "_last",
         "_lost",
-        "_newest",
         "_period_ns",
         "_sent",
         "_used",
+        "latest",
         "plan",
     )
 
@@ -91,7 +91,7 @@ class Link:
         self._block_number = -1
         self._due_ns = plan.first_ns  # when the next message is sent
         self._sent = self._delivered = self._lost = self._used = self._held = 0
-        self._newest = self._last = -1
+        self.latest = self._last = -1
         self._flying: list[tuple[int, int]] = []
         self._age_sum = self._age_max = 0
 
@@ -120,7 +120,7 @@ class Link:
     def newest(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
         if self._ideal:
-            self._newest = newest = (time_ns - self._first_ns) // self._period_ns
+            self.latest = newest = (time_ns - self._first_ns) // self._period_ns
             return newest
         while self._due_ns <= time_ns:
             delay = self.fate(self._sent)
@@ -133,8 +133,8 @@ class Link:
         while self._flying and self._flying[0][0] <= time_ns:
             _, sequence = heappop(self._flying)
             self._delivered += 1
-            self._newest = max(self._newest, sequence)
-        return self._newest
+            self.latest = max(self.latest, sequence)
+        return self.latest
 
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
         """Counts a use at `time_ns` of message number `sequence`, which was sent at `sent_ns`."""
@@ -151,7 +151,7 @@ class Link:
         """Returns the counts up to the last instant for which `newest` was called."""
         sent, delivered = self._sent, self._delivered
         if self._ideal:
-            sent = delivered = self._newest + 1
+            sent = delivered = self.latest + 1
         return LinkCounts(
             self.plan.source,
             self.plan.receiver,

@@ -12,7 +12,7 @@ from math import gcd
 from typing import Final
 
 from echelon.messages import Heard, Message
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.plan import Plan
 from echelon.role import Input, Role
 from echelon.runtime.link import Link, LinkCounts
 
@@ -28,7 +28,12 @@ class _Slot:
     """One input of a role: its link and the messages that have come."""
 
     link: Link
-    plan: LinkPlan
+    ideal: bool
+    first_ns: int
+    period_ns: int
+    timeout_ns: int
+    size: int | None
+    """As in the plan of the link; they stand here because they are read at every message"""
     capacity: int
     """If `newer` holds more messages than this, some of them are lost ones, and these are removed"""
     ahead_ns: int | None
@@ -54,7 +59,11 @@ class Mailbox:
         self._slots = {
             (link.channel, link.source): _Slot(
                 Link(link, plan.seed, names[link.source], names[role.index]),
-                link,
+                link.ideal,
+                link.first_ns,
+                link.period_ns,
+                link.timeout_ns,
+                link.size,
                 2 * (link.delay_max_ns // link.period_ns) + SLACK,
                 max(MAX_AHEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
                 if paced and not link.ideal
@@ -76,7 +85,7 @@ class Mailbox:
         slot = self._slots.get((message.channel, message.source))
         if slot is None:
             self.unexpected += 1
-        elif message.values.size != slot.plan.size and message.values.size and slot.plan.size is not None:
+        elif message.values.size != slot.size and message.values.size and slot.size is not None:
             self.misshapen += 1
         elif message.sequence > slot.in_use:
             slot.newer[message.sequence] = message
@@ -87,12 +96,11 @@ class Mailbox:
         """Returns the links whose message in use at `time_ns` has not come; the list is empty if the stage can run."""
         waiting = []
         for slot in self._stage_slots[stage]:
-            link = slot.link
-            number = link.newest(time_ns)
+            number = (time_ns - slot.first_ns) // slot.period_ns if slot.ideal else slot.link.newest(time_ns)
             if (number > slot.in_use and number not in slot.newer) or (
-                slot.ahead_ns is not None and link.sent_ns(slot.newest) < time_ns - slot.ahead_ns
+                slot.ahead_ns is not None and slot.link.sent_ns(slot.newest) < time_ns - slot.ahead_ns
             ):
-                waiting.append(link)
+                waiting.append(slot.link)
         return waiting
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
@@ -104,7 +112,10 @@ class Mailbox:
         heard: list[Heard] = []
         for slot in self._stage_slots[stage]:
             link, newer = slot.link, slot.newer
-            number = link.newest(time_ns)
+            if slot.ideal:  # as `Link.newest`, without the call
+                link.latest = number = (time_ns - slot.first_ns) // slot.period_ns
+            else:
+                number = link.newest(time_ns)
             if newer:
                 if number not in newer and number > slot.in_use:
                     number = self._newest_come(slot, time_ns)
@@ -117,7 +128,7 @@ class Mailbox:
                 elif len(newer) > slot.capacity:
                     slot.newer = {each: newer[each] for each in newer if link.fate(each) is not None}
             current = slot.current
-            if current is None or not current.values.size or time_ns - current.time_ns > slot.plan.timeout_ns:
+            if current is None or not current.values.size or time_ns - current.time_ns > slot.timeout_ns:
                 heard.append(None)
             else:
                 link.note_use(time_ns, current.sequence, current.time_ns)

@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import REGISTRY, load
-from support.runs import ROOT, SCENARIOS
+from support.runs import SCENARIOS
 
 SPIRAL = """
 from math import cos, sin
@@ -181,14 +180,6 @@ def test_an_inherited_parameter_needs_its_type_again(folder: Path) -> None:
 def test_a_type_that_pydantic_does_not_know_is_one_line(folder: Path) -> None:
     (folder / "my_paths.py").write_text(SPIRAL.replace("rate: float = 0.2", "rate: np.ndarray = 0.2"))
     assert "my_paths.py:Spiral: Pydantic" in refused(folder, USE_SPIRAL)
-
-
-def test_the_processes_of_a_run_do_not_need_pydantic() -> None:
-    """Nor do the parts that are built in: imports of a process take time in every start, and memory in every process."""
-    modules = "echelon.sim.processes.process", "echelon.bridge.protocols.registry", "echelon.sim.processes.watchers"
-    program = f"import sys, {', '.join(modules)}; print('pydantic' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"
 
 
 def test_files_of_one_name_in_two_folders_are_different_modules(

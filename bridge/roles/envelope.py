@@ -14,9 +14,9 @@ The gate itself may go to zero from any torque.  The limits then count from this
 the first call the gate also starts from zero.
 """
 
+import math
 from collections import Counter, deque
 from enum import StrEnum
-from math import inf, isfinite
 from typing import NamedTuple
 
 from echelon.plan.can_plan import EnvelopePlan
@@ -54,12 +54,12 @@ class Envelope:
                 raise ValueError(f"{name} must be 0 or more, not {getattr(plan, name)!r}")
         self.plan = plan
         self.rejections: Counter[Rejection] = Counter()
-        self._clock_ns = -inf
+        self._clock_ns = -math.inf
         self._wheels = _Wheel(plan), _Wheel(plan)
 
     def check(self, now_ns: int, command_ns: int, tau_right: float, tau_left: float) -> Verdict:
         """Returns the torques to send at `now_ns` if `tau_right` and `tau_left` [N m] were commanded at `command_ns`."""
-        if self._clock_ns == -inf:
+        if self._clock_ns == -math.inf:
             self.stop(now_ns)
         reason = self._rejection(now_ns, command_ns, tau_right, tau_left)
         if reason is None:
@@ -82,7 +82,7 @@ class Envelope:
             return Rejection.FUTURE
         if now_ns - command_ns > self.plan.stale_ns:
             return Rejection.STALE
-        if not (isfinite(tau_right) and isfinite(tau_left)):
+        if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
             return Rejection.NOT_FINITE
         right, left = self._wheels
         return right.rejection(now_ns, tau_right) or left.rejection(now_ns, tau_left)
@@ -113,24 +113,17 @@ class _Wheel:
             return Rejection.RISE
         if before - plan.fall_limit > common:
             return Rejection.FALL
-        if self._window(now_ns, torque) > plan.window_limit:
+        if _largest(self.highs, now_ns, torque) + _largest(self.lows, now_ns, -torque) > plan.window_limit:
             return Rejection.WINDOW
         self.sent = torque
         return None
 
-    def _window(self, now_ns: int, torque: float) -> float:
-        """Adds a torque to the window and drops what is too old; returns the largest less the smallest torque in it.
 
-        `highs` and `lows` are treated alike; they stand here twice since this is called for each wheel in each cycle."""
-        highs, lows, oldest_ns, negated = self.highs, self.lows, now_ns - WINDOW_NS, -torque
-        while highs and highs[-1][1] <= torque:
-            highs.pop()
-        highs.append((now_ns, torque))
-        while highs[0][0] < oldest_ns:
-            highs.popleft()
-        while lows and lows[-1][1] <= negated:
-            lows.pop()
-        lows.append((now_ns, negated))
-        while lows[0][0] < oldest_ns:
-            lows.popleft()
-        return highs[0][1] + lows[0][1]
+def _largest(window: deque[tuple[float, float]], now_ns: int, value: float) -> float:
+    """Adds a value to a window of falling values and drops what is too old; returns the largest value."""
+    while window and window[-1][1] <= value:
+        window.pop()
+    window.append((now_ns, value))
+    while window[0][0] < now_ns - WINDOW_NS:
+        window.popleft()
+    return window[0][1]

@@ -11,11 +11,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from echelon.errors import UserError
+from echelon.part_groups import Registry
 from echelon.plan.plan import Plan
 from echelon.planning.explain import explain, is_array, key_text, short
 from echelon.planning.missing_keys import fill_missing
 from echelon.planning.plan_maker import PlanError, make_plan
-from echelon.plugins import Registry, Source
+from echelon.plugins import Source
 from echelon.scenario.part_fields import PartContext
 from echelon.scenario.tables import Scenario
 

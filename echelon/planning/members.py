@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from echelon.errors import Mistakes
+from echelon.part_groups import Registry
 from echelon.plan.can_plan import CanPlan
 from echelon.plan.delay_tables import TRUE_CLOCK, ClockPlan
 from echelon.plan.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.planning import shapes
 from echelon.planning.drives import DriveMaker, make_can
-from echelon.plugins import Part, Registry
+from echelon.plugins import Part
 from echelon.scenario.can_tables import DriveTable
 from echelon.scenario.link_tables import Clock
 from echelon.scenario.tables import EVENT_DRIVEN, Group, RobotTable, Scenario, Shape, Timing

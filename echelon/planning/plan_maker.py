@@ -12,6 +12,7 @@ from math import dist
 import numpy as np
 
 from echelon.errors import Mistakes
+from echelon.part_groups import Registry
 from echelon.plan.can_plan import BusRolePlan, CanPlan, EventPlan
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import (
@@ -30,7 +31,6 @@ from echelon.planning.blocks import fitting, make_blocks, make_coupling
 from echelon.planning.drives import make_events
 from echelon.planning.links import make_links
 from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
-from echelon.plugins import Registry
 from echelon.scenario.tables import Law, Scenario
 from echelon.scenario.values import path_matches
 

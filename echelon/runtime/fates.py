@@ -23,11 +23,9 @@ before.  The Gaussian sequence begins anew every `CHAIN` messages.
 import hashlib
 from bisect import bisect_right
 from functools import cache
-from statistics import NormalDist
 from typing import Final
 
 import numpy as np
-from numpy.random import Philox
 from numpy.typing import NDArray
 
 from echelon.messages import Channel, Values
@@ -69,6 +67,8 @@ def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
 
 def words(key: int, block: int, stream: int = LOSS) -> Words:
     """Returns the words of a block, whole numbers of 53 bits, shape (BLOCK, 2)."""
+    from numpy.random import Philox  # 7 MB and 12 ms in each process, which ideal links do not need
+
     raw = Philox(key=key, counter=(stream << 192) + block * (BLOCK // 2)).random_raw(2 * BLOCK)
     return (raw >> np.uint64(64 - BITS)).astype(np.int64).reshape(BLOCK, 2)
 
@@ -134,6 +134,7 @@ class Fates:
         """The copies of every message, where they are the same for all"""
         self.by_instant = bool(plan.blackouts) or (isinstance(plan.delays, DelayTrace) and bool(plan.delays.times_ns))
         """True if the instant of sending matters: then `of` differs from `drawn`"""
+        self.drawn(0)  # so that on a wall clock no stage has to wait for the imports of the first draw
 
     def of(self, sequence: int, sent_ns: int) -> Copies:
         """Returns the delays [ns] of the copies of message number `sequence`, which is sent at `sent_ns`."""
@@ -269,6 +270,8 @@ def _as_tuples(delays: Words) -> list[Copies]:
 @cache
 def normal_table() -> Words:
     """Returns the table over u of the standard normal distribution, in units of 2⁻²⁸."""
+    from statistics import NormalDist  # slow to import, and only correlated delays need it
+
     below = edges() * 2.0**-BITS
     below[0] = below[1] / 2  # the distribution has no end; its last cell ends in its middle
     half = np.array([round(z * 2**Z_BITS) for z in map(NormalDist().inv_cdf, below.tolist())])

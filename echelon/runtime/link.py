@@ -53,7 +53,7 @@ class LinkCounts:
 
 
 class Link:
-    """One directed link with its state.  Instants must be given in ascending order."""
+    """One directed link with its state.  Instants must be given in ascending order; `latest` is the number last in use."""
 
     __slots__ = (
         "_age_max",
@@ -71,11 +71,11 @@ class Link:
         "_last",
         "_latest_ns",
         "_lost",
-        "_newest",
         "_open",
         "_period_ns",
         "_sent",
         "_used",
+        "latest",
         "plan",
     )
 
@@ -86,7 +86,7 @@ class Link:
         self._latest_ns = plan.first_ns
         """The latest arrival so far, of first copies"""
         self._sent = self._delivered = self._duplicates = self._lost = self._used = self._held = 0
-        self._newest = self._last = self._expected = -1
+        self.latest = self._last = self._expected = -1
         self._open: list[tuple[int, int]] = []
         """Messages that are due, not lost, and not in `_flying` yet, by number: number and earliest possible arrival"""
         self._flying: list[tuple[int, int]] = []
@@ -113,11 +113,6 @@ class Link:
         if self.plan.punctual:
             return self._fates.of(sequence, self.sent_ns(sequence))
         return self._fates.drawn(sequence)
-
-    def due_by(self, time_ns: int) -> int:
-        """Returns the number of the message in use at `time_ns` on a prompt link: the last one that is due."""
-        self._newest = newest = (time_ns - self._first_ns) // self._period_ns
-        return newest
 
     def take_up(self, time_ns: int, until_ns: int, came: dict[int, Message], in_use: int) -> bool:
         """Takes up the messages that are due at `time_ns` and may arrive by `until_ns`; returns True if none of them is
@@ -200,12 +195,12 @@ class Link:
         while flying and flying[0][0] <= time_ns:
             _, sequence = heappop(flying)
             self._delivered += 1
-            if sequence > self._newest:
-                self._newest = sequence
+            if sequence > self.latest:
+                self.latest = sequence
         while copies and copies[0] <= time_ns:
             heappop(copies)
             self._duplicates += 1
-        return self._newest
+        return self.latest
 
     def next_arrival(self, than: int) -> int | None:
         """Returns the first instant at which a message arrives that is newer than number `than`, of those on their way."""
@@ -228,7 +223,7 @@ class Link:
         """Returns the counts up to the last instant for which a number was asked."""
         sent, delivered = self._sent, self._delivered
         if self.plan.prompt:
-            sent = delivered = self._newest + 1
+            sent = delivered = self.latest + 1
         p50, p95, p99 = self._ages.percentiles(PERCENTILES, self._used - self._aged)
         return LinkCounts(
             self.plan.source,

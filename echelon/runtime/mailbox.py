@@ -52,6 +52,12 @@ class _Slot:
 
     link: Link
     plan: LinkPlan
+    prompt: bool
+    first_ns: int
+    period_ns: int
+    timeout_ns: int
+    size: int | None
+    """As in `plan`; they stand here because they are read at every message"""
     ahead_ns: int | None
     """How far the role may be ahead of the newest message that has come, even if the link loses that message.  None: no limit;
     so on a prompt link, where the role waits for every message anyway"""
@@ -64,22 +70,26 @@ class _Slot:
     newest: int = -1
     """The largest number of a message that has come"""
 
-    def hear(self, number: int, time_ns: int) -> Heard:
-        """Uses message number `number` from now on, if it has come and is newer; returns the message in use at `time_ns`."""
-        newer = self.newer
-        if number > self.in_use and newer:
+    def hear(self, time_ns: int) -> Heard:
+        """Takes the newest message that has arrived, if it is newer than the one in use; returns the message in use."""
+        newer, link = self.newer, self.link
+        if self.prompt:  # as `Link.newest`, without the call
+            link.latest = number = (time_ns - self.first_ns) // self.period_ns
+        else:
+            number = link.newest(time_ns)
+        if newer and number > self.in_use:
             message = newer.pop(number, None)
             if message is not None:
                 if newer:  # forget the messages that this one overtakes
                     for overtaken in range(self.in_use + 1, number):
                         newer.pop(overtaken, None)
                 self.current, self.in_use = message, number
-        current, plan = self.current, self.plan
+        current = self.current
         if current is None or not current.values.size:
             return None
-        if plan.timeout_ns != NEVER_NS and plan.read_age_ns(time_ns, current.time_ns) > plan.timeout_ns:
-            return current._replace(values=np.zeros(current.values.size)) if plan.policy == "zero" else None
-        self.link.note_use(time_ns, current.sequence, current.time_ns)
+        if self.timeout_ns != NEVER_NS and self.plan.read_age_ns(time_ns, current.time_ns) > self.timeout_ns:
+            return current._replace(values=np.zeros(current.values.size)) if self.plan.policy == "zero" else None
+        link.note_use(time_ns, current.sequence, current.time_ns)
         return current
 
 
@@ -94,6 +104,11 @@ class Mailbox:
             (link.channel, link.source): _Slot(
                 Link(link, plan.seed, names[link.source], names[role.index]),
                 link,
+                link.prompt,
+                link.first_ns,
+                link.period_ns,
+                link.timeout_ns,
+                link.size,
                 max(MAX_AHEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
                 if paced and not link.prompt
                 else None,
@@ -103,7 +118,7 @@ class Mailbox:
         self._stages = role.stages
         self._end_ns = plan.duration_ns
         self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
-        heard_at_once = [all(slot.plan.prompt for slot in slots) for slots in self._stage_slots]
+        heard_at_once = [all(slot.prompt for slot in slots) for slots in self._stage_slots]
         self.prompt = [all(heard_at_once[: number + 1]) for number in range(len(heard_at_once))]
         """For each stage, whether its inputs and those of the stages before it are all on prompt links.  Then it acts at its
         nominal instants"""
@@ -128,13 +143,13 @@ class Mailbox:
         if slot is None:
             self.unexpected += 1
             return None
-        plan, number = slot.plan, message.sequence
-        if message.values.size != plan.size and message.values.size and plan.size is not None:
+        number = message.sequence
+        if message.values.size != slot.size and message.values.size and slot.size is not None:
             self.misshapen += 1
             return None
         if number > slot.newest:
             slot.newest = number
-        if number <= slot.in_use or (not plan.prompt and slot.link.is_lost(number)):
+        if number <= slot.in_use or (not slot.prompt and slot.link.is_lost(number)):
             return None
         return slot
 
@@ -145,14 +160,14 @@ class Mailbox:
         until_ns = self._last_ns(self._stages[stage], time_ns)
         for slot in self._stage_slots[stage]:
             link = slot.link
-            if slot.plan.prompt:
-                number = link.due_by(time_ns)
+            if slot.prompt:
+                number = (time_ns - slot.first_ns) // slot.period_ns
                 if number > slot.in_use and number not in slot.newer:
                     waiting.append(link)
             elif not link.take_up(time_ns, until_ns, slot.newer, slot.in_use) or (
                 slot.ahead_ns is not None and link.sent_ns(slot.newest) < time_ns - slot.ahead_ns
             ):
-                waiting.append(link)
+                waiting.append(slot.link)
         return waiting
 
     def acts(self, stage: int, time_ns: int) -> list[Act]:
@@ -163,7 +178,7 @@ class Mailbox:
         of, slots = self._stages[stage], self._stage_slots[stage]
         last_ns = self._last_ns(of, time_ns)
         for slot in slots:
-            if not slot.plan.prompt:
+            if not slot.prompt:
                 slot.link.take_up(time_ns, last_ns, slot.newer, slot.in_use)
         at_ns = max(time_ns, self._acted_ns)
         if of.acts is Acts.WHEN_HEARD:
@@ -185,11 +200,7 @@ class Mailbox:
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
         """Returns the messages in use at `time_ns`, one for each input of the stage; None where no message is in use."""
-        heard: list[Heard] = []
-        for slot in self._stage_slots[stage]:
-            link = slot.link
-            heard.append(slot.hear(link.due_by(time_ns) if slot.plan.prompt else link.newest(time_ns), time_ns))
-        return heard
+        return [slot.hear(time_ns) for slot in self._stage_slots[stage]]
 
     def next_change(self, stage: int, time_ns: int) -> int:
         """Returns the first instant after `time_ns` at which a stage hears something newer, or at which a message in use
@@ -244,7 +255,7 @@ def _heard_ns(slot: _Slot, time_ns: int, at_ns: int, last_ns: int) -> int:
     link = slot.link
     if link.due(time_ns) <= slot.in_use:
         return at_ns
-    if slot.plan.prompt or link.newest(at_ns) > slot.in_use:
+    if slot.prompt or link.newest(at_ns) > slot.in_use:
         return at_ns
     arrives_ns = link.next_arrival(slot.in_use)
     return last_ns if arrives_ns is None else max(at_ns, arrives_ns)
@@ -255,7 +266,7 @@ def _change_ns(slot: _Slot, time_ns: int) -> int:
     arrives_ns = slot.link.next_arrival(slot.in_use)
     change_ns = NEVER_NS if arrives_ns is None else arrives_ns
     current = slot.current
-    if current is not None and current.values.size and slot.plan.timeout_ns < NEVER_NS:
+    if current is not None and current.values.size and slot.timeout_ns < NEVER_NS:
         expires_ns = slot.plan.expires_ns(current.time_ns)
         if time_ns < expires_ns < change_ns:
             return expires_ns

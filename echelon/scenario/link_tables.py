@@ -16,14 +16,13 @@ from pydantic import (
     model_validator,
 )
 
-from echelon.plugins import Source, read_source
+from echelon.parameters import Finite, NonNegative, Positive
+from echelon.part_groups import read_source
+from echelon.plugins import Source
 from echelon.scenario.part_fields import PartContext
 from echelon.scenario.values import (
-    Finite,
     Fraction,
     Name,
-    NonNegative,
-    Positive,
     Seconds,
     SecondsOrZero,
     Table,

@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field, SerializationInfo, field_serializer, model_validator
 
+from echelon.parameters import Finite, NonNegative, Point, Positive
 from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop
 from echelon.scenario.link_tables import Blackout, Clock, CutOff, LinkRule
 from echelon.scenario.part_fields import (
@@ -22,15 +23,11 @@ from echelon.scenario.part_fields import (
 )
 from echelon.scenario.values import (
     CouplingGain,
-    Finite,
     Flag,
     Fraction,
     Gain,
     Limit,
     Name,
-    NonNegative,
-    Point,
-    Positive,
     Seconds,
     Table,
     alike,

@@ -54,6 +54,7 @@ class PunctualLink(Link):
     def newest(self, time_ns: int) -> int:
         """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
         if self.plan.prompt:
-            return self.due_by(time_ns)
+            self.latest = self.due(time_ns)
+            return self.latest
         self.take_up(time_ns, time_ns, self._come, -1)
         return super().newest(time_ns)

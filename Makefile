@@ -6,15 +6,11 @@ BIN := $(VENV)/bin
 
 # The quick part of the tests: rooms without input and output, and those that lean on a dependency.  No vcan, no wall clock,
 # nothing marked `slow`.
-ROOMS := $(addprefix tests/, planning plan controller agents runtime bridge/protocols bridge/timing bridge/can sim/results \
-  sim/recording sim/report)
-HELP := $(addprefix tests/cli/test_cli_help.py::, test_bash_knows_all_commands_and_all_options \
-  test_scripts_of_other_shells_know_the_commands)
-QUICK := -m "not slow" $(ROOMS) $(HELP)
-# Whole drives, hosts and referees in one process.  These tests only compute, too, but depend on nobody's version.
-MODELS := $(addprefix tests/, conformance bridge/roles bridge/referee sim/engines sim/forecast)
+QUICK := -m "not slow" tests/planning tests/plan tests/controller tests/agents tests/runtime \
+  tests/bridge/protocols tests/bridge/timing tests/bridge/can tests/sim/results tests/sim/recording tests/sim/report \
+  $(addprefix tests/cli/test_cli_help.py::, test_bash_knows_all_commands_and_all_options test_scripts_of_other_shells_know_the_commands)
 
-.PHONY: help setup demo docs test test-quick test-models test-rest test-lowest test-newest lint bench lock clean
+.PHONY: help setup demo docs test test-quick test-lowest test-newest lint bench lock clean
 help: ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
@@ -55,13 +51,6 @@ test: $(VENV)/.dev ## all tests
 
 test-quick: $(VENV)/.dev ## the quick part of the tests
 	$(BIN)/python -m pytest $(QUICK) $(ARGS)
-
-test-models: $(VENV)/.dev ## tests of whole drives, hosts and referees in one process
-	$(BIN)/python -m pytest $(MODELS) $(ARGS)
-
-test-rest: $(VENV)/.dev ## all tests but the quick part and the models: those with processes, commands, buses, clocks
-	$(BIN)/python -m pytest -m slow $(ROOMS) $(ARGS)
-	$(BIN)/python -m pytest $(addprefix --ignore=, $(ROOMS) $(MODELS)) $(addprefix --deselect=, $(HELP)) $(ARGS)
 
 # Environments for other versions.  uv makes them, since it takes seconds where pip takes minutes.
 $(VENV)-lowest/.made: requirements-lowest.lock pyproject.toml $(VENV)/.dev

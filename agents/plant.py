@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 from echelon.errors import PartRunError
 from echelon.parameters import NonNegative, Point
 from echelon.plan.plan import RobotPlan
-from echelon.plugins import Plugin
+from echelon.plugins import PART_ERRORS, Plugin
 
 GRAVITY: Final = 9.81
 """Acceleration of gravity [m/s²]"""
@@ -238,7 +238,7 @@ def make_step(robot: RobotPlan) -> Step:
         return plant.step_of(robot)
     try:
         step = plant.step_of(robot)
-    except Exception as error:
+    except PART_ERRORS as error:
         raise robot.model.raised(f" of {robot.name}", "step_of", error) from error
     return _checked(step, robot)
 
@@ -255,7 +255,7 @@ def _checked(step: Step, robot: RobotPlan) -> Step:
         diverged = not all(abs(number) < _HUGE for number in given)
         try:
             after = step(state, tau_right, tau_left, h)
-        except Exception as error:
+        except PART_ERRORS as error:
             if diverged and isinstance(error, (ValueError, OverflowError)):
                 raise
             raise robot.model.raised(f" of {robot.name}", "step", error) from error

@@ -13,7 +13,7 @@ import numpy as np
 from echelon.errors import PartRunError
 from echelon.parameters import Finite, Limits, NonNegative, Point, Positive
 from echelon.plan.plan import Array
-from echelon.plugins import Part, Plugin
+from echelon.plugins import PART_ERRORS, Part, Plugin
 
 
 class Trajectory(Plugin, ABC):
@@ -136,7 +136,7 @@ class _Checked:
         of the shape (3, 2)."""
         try:
             answer = np.asarray(self._part.made.at(t), dtype=np.float64)
-        except Exception as error:
+        except PART_ERRORS as error:
             raise self._part.raised("", f"at({t:g})", error) from error
         if answer.shape != (3, 2):
             raise PartRunError(f"{self._part.use}: at({t:g}) has the shape {answer.shape}, not (3, 2)")

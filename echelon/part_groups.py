@@ -19,7 +19,7 @@ from typing import Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from echelon.plugins import Part, PartError, Plugin, Source, class_in, error_text
+from echelon.plugins import PART_ERRORS, Part, PartError, Plugin, Source, class_in, error_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class PartGroup:
             raise PartError(self._unknown(use, [*self.built_in, *installed]))
         try:
             found = installed[use].load()
-        except Exception as error:
+        except PART_ERRORS as error:
             raise PartError(f"the installed {installed[use].value} cannot be loaded: {error_text(error)}") from None
         return self._checked(found, use), None
 
@@ -60,7 +60,7 @@ class PartGroup:
         except ValidationError as error:
             errors = error.errors(include_url=False)
             raise PartError("wrong parameters", errors=errors, model=found) from None
-        except Exception as error:  # a part's own validator may raise anything
+        except PART_ERRORS as error:  # a part's own validator may raise anything
             raise PartError(f"{use} refuses its parameters: {error_text(error)}") from None
         return Part(use, adapter.dump_python(made, mode="json", exclude_none=True), source, made)
 
@@ -71,7 +71,7 @@ class PartGroup:
             raise PartError(f"{use} lacks the method {', '.join(missing)}")
         try:
             _adapter(cast(Any, found))
-        except Exception as error:  # a type that pydantic does not know
+        except PART_ERRORS as error:  # a type that pydantic does not know
             raise PartError(f"{use}: {error_text(error)}") from None
         return found
 

@@ -30,6 +30,11 @@ GROUPS: Final = ("laws", "plants", "trajectories", "protocols")
 """The kinds of parts; `echelon.<group>` is the group of their entry points."""
 
 
+PART_ERRORS: Final = (Exception, SystemExit)
+"""What the code of a part may raise.  `sys.exit()` in a part is a failure of that part: it must not end a process of a run as
+if its work were done."""
+
+
 class PartError(ValueError):
     """A scenario names a part that does not exist or cannot be loaded, or gives it wrong parameters.
 
@@ -72,7 +77,7 @@ class Plugin:
             elif not (
                 name.startswith("_") or name in inherited or hasattr(value, "__get__") or isinstance(value, type)
             ):
-                raise PartError(f"{name} needs a type: {name}: {_type_of(value)} = {value!r}")
+                raise PartError(f"{cls.__name__}: {name} needs a type: {name}: {_type_of(value)} = {value!r}")
         dataclass(frozen=True, kw_only=True)(cls)
 
 
@@ -116,7 +121,7 @@ class Part(Generic[T_co]):
             and frame.f_code.co_filename != "<string>"  # a method that `dataclass` made
         ]
 
-    def raised(self, whom: str, what: str, error: Exception) -> PartRunError:
+    def raised(self, whom: str, what: str, error: BaseException) -> PartRunError:
         """Returns the error for a call of the part that raised: the line of its file where it raised, and what.
 
         `what` names the call, and `whom` says for what it was made (" of block g1")."""
@@ -180,7 +185,9 @@ def _module(source: Source) -> ModuleType:
         del sys.modules[name]
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise PartError(f"{source.name}: {error_text(error)}") from None
+        lines = [line for frame, line in walk_tb(error.__traceback__) if frame.f_code.co_filename == source.name]
+        where = f", line {lines[-1]}" if lines else ""
+        raise PartError(f"{source.name}{where}: {error_text(error)}") from None
     return module
 
 

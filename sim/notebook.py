@@ -9,6 +9,7 @@ import tomlkit
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.planning.loading import effective_toml
+from echelon.plugins import Plugin
 from echelon.scenario.tables import Scenario
 from echelon.shipped import EFFECTIVE, scenario_path
 from echelon.sim import run_folder
@@ -44,7 +45,8 @@ def load(scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> Loa
             return scenario
         return Loaded(*parts.parse(effective_toml(scenario.scenario), scenario.scenario.name, overrides))
     if isinstance(scenario, Mapping):
-        return Loaded(*parts.parse(tomlkit.dumps(dict(scenario)), "scenario", overrides))
+        text = "".join(f"{tomlkit.key(str(key)).as_string()} = {toml_value(item)}\n" for key, item in scenario.items())
+        return Loaded(*parts.parse(text, "scenario", overrides))
     return Loaded(*parts.load(scenario_path(str(scenario)), overrides))
 
 
@@ -154,5 +156,11 @@ def toml_value(value: Any) -> str:
             "{"
             + ", ".join(f"{tomlkit.key(str(key)).as_string()} = {toml_value(item)}" for key, item in value.items())
             + "}"
+        )
+    if isinstance(value, (type, Plugin)):
+        name = value.__name__ if isinstance(value, type) else type(value).__name__
+        raise UserError(
+            f"{name}: a scenario names a class by its file, which every process of a run reads: write it into a file beside "
+            f"the scenario, my_laws.py for example, and give 'my_laws.py:{name}'"
         )
     raise UserError(f"{value!r}: must be a number, a string, a boolean, a list or a dictionary to be set in a scenario")

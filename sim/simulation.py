@@ -78,9 +78,17 @@ class Simulation:
     def step(self) -> float:
         """Lets the robots act on `commands` and goes on to the next instant; returns its run time [s].
 
-        Raises UserError when the run is over (`done`)."""
+        Raises UserError when the run is over (`done`), and for commands that you have changed to anything but two finite
+        numbers, or two NaN: the robot gets no command."""
         if self.done:
             raise UserError(f"the simulation is over at {self.t:g} s; reset() begins anew")
+        for robot in self.plan.robots:
+            wanted = self.commands[robot.index]
+            if not (np.isfinite(wanted).all() or np.isnan(wanted).all() or self._is_own(robot.index)):
+                raise UserError(
+                    f"commands[{robot.index}] = {wanted.tolist()}, of {robot.name}: must be two finite numbers [m/s²], or two "
+                    "NaN for no command"
+                )
         next(self._moves)
         return self.t
 

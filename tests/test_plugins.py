@@ -174,7 +174,9 @@ def test_parameters_are_checked_by_their_types_and_by_the_class(folder: Path, ov
 
 def test_an_inherited_parameter_needs_its_type_again(folder: Path) -> None:
     (folder / "my_paths.py").write_text(SPIRAL + "\n\nclass Fast(Spiral):\n    rate = 0.9\n")
-    assert "my_paths.py: rate needs a type: rate: float = 0.9" in refused(folder, 'trajectory={use="my_paths.py:Fast"}')
+    assert "my_paths.py, line 15: Fast: rate needs a type: rate: float = 0.9" in refused(
+        folder, 'trajectory={use="my_paths.py:Fast"}'
+    )
 
 
 def test_a_type_that_pydantic_does_not_know_is_one_line(folder: Path) -> None:
@@ -217,13 +219,16 @@ def test_mistakes_name_key_value_and_what_is_allowed(folder: Path, override: str
     assert says in refused(folder, override)
 
 
+UNTYPED = "my_paths.py, line 6: Spiral: rate needs a type: rate: "
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("class Spiral(:\n", "my_paths.py, line 1: invalid syntax"),
-        ("import nowhere_at_all\n", "my_paths.py: ModuleNotFoundError: No module named 'nowhere_at_all'"),
-        ("1 / 0\n", "my_paths.py: ZeroDivisionError: division by zero"),
-        ("raise SystemExit(0)\n", "my_paths.py: SystemExit: 0"),
+        ("import nowhere_at_all\n", "my_paths.py, line 1: ModuleNotFoundError: No module named 'nowhere_at_all'"),
+        ("1 / 0\n", "my_paths.py, line 1: ZeroDivisionError: division by zero"),
+        ("raise SystemExit(0)\n", "my_paths.py, line 1: SystemExit: 0"),
         (
             "from echelon.controller.trajectory import Trajectory\nclass Spiral(Trajectory): pass\n",
             "lacks the method at",
@@ -232,11 +237,11 @@ def test_mistakes_name_key_value_and_what_is_allowed(folder: Path, override: str
             SPIRAL.replace("rate: float", "rates: float"),
             "trajectory.parameters.rate: unknown key; did you mean 'rates'?",
         ),
-        (SPIRAL.replace("rate: float = 0.2", "rate = 0.2"), "my_paths.py: rate needs a type: rate: float = 0.2"),
-        (SPIRAL.replace("rate: float = 0.2", "rate = np.pi * 1j"), "my_paths.py: rate needs a type: rate: complex = "),
+        (SPIRAL.replace("rate: float = 0.2", "rate = 0.2"), f"{UNTYPED}float = 0.2"),
+        (SPIRAL.replace("rate: float = 0.2", "rate = np.pi * 1j"), f"{UNTYPED}complex = "),
         (
             SPIRAL.replace("rate: float = 0.2", "rate = np.zeros(1)"),
-            "my_paths.py: rate needs a type: rate: … = array([0.])",
+            f"{UNTYPED}… = array([0.])",
         ),
         ("\0", "source code string cannot contain null bytes"),
     ],
@@ -244,6 +249,17 @@ def test_mistakes_name_key_value_and_what_is_allowed(folder: Path, override: str
 def test_a_file_that_cannot_be_used_is_one_line(folder: Path, text: str, says: str) -> None:
     (folder / "my_paths.py").write_text(text)
     assert says in refused(folder, USE_SPIRAL)
+
+
+@pytest.mark.parametrize("uses", ['{"gain"}', '{"gains", "leads"}', '"gains"', '["lead"]', "None"])
+def test_what_a_law_uses_is_checked(folder: Path, uses: str) -> None:
+    text = (
+        f"from echelon import Law\n\n\nclass Mine(Law):\n    uses = {uses}\n\n    def nu(self, *given):\n        pass\n"
+    )
+    (folder / "my_laws.py").write_text(text)
+    says = "my_laws.py, line 4: Mine: uses = "
+    assert says in refused(folder, 'law={use="my_laws.py:Mine"}')
+    assert "must be a set of 'gains', 'lead' or both" in refused(folder, 'law={use="my_laws.py:Mine"}')
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from echelon.bridge.protocols.observe import Finding, Observer, WheelReading
 from echelon.bridge.protocols.protocol import DriveProtocol
 from echelon.errors import PartRunError
 from echelon.plan.plan import RobotPlan
-from echelon.plugins import Part
+from echelon.plugins import PART_ERRORS, Part
 
 
 class Caller:
@@ -53,7 +53,7 @@ class Caller:
         If that function is a method of a base class, the error names the method of the protocol that it called."""
         try:
             return function(*arguments)
-        except Exception as error:
+        except PART_ERRORS as error:
             whose, s, _ = what.rpartition("'s ")
             if s and (calls := self.part.calls_in(error)):
                 what = f"{whose}{s}{calls[0][0]}"

@@ -19,7 +19,7 @@ import numpy as np
 
 from echelon.errors import PartRunError
 from echelon.plan.plan import Array, BlockPlan, Plan
-from echelon.plugins import Part, Plugin
+from echelon.plugins import PART_ERRORS, Part, PartError, Plugin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +73,11 @@ class Law(Plugin, ABC):
     uses: ClassVar[frozenset[str]] = frozenset()
     """The keys `gains` and `lead` of `[law]` that the law uses.  A scenario that sets one that is not used is refused"""
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if not (isinstance(cls.uses, (set, frozenset)) and cls.uses <= {"gains", "lead"}):
+            raise PartError(f"{cls.__name__}: uses = {cls.uses!r:.60}: must be a set of 'gains', 'lead' or both")
+
     @abstractmethod
     def nu(self, block: Block, t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
         """Returns ν [m/s²], (size,), for the error e [m] and its rate ė [m/s] at t [s].
@@ -122,7 +127,7 @@ def make_nu(part: Part[Any], block: Block) -> Nu:
         return law.nu_of(block)
     try:
         nu = law.nu_of(block)
-    except Exception as error:
+    except PART_ERRORS as error:
         raise part.raised(f" of block {block.name}", "nu_of", error) from error
     return _checked(nu, part, block)
 
@@ -133,7 +138,7 @@ def make_state(part: Part[Any], block: Block) -> Array:
     who = f"{part.use} of block {block.name}"
     try:
         size = law.state_size(block)
-    except Exception as error:
+    except PART_ERRORS as error:
         raise part.raised(f" of block {block.name}", "state_size", error) from error
     if not isinstance(size, int) or size < 0:
         raise PartRunError(f"{who}: state_size must be a whole number that is not negative, not {size!r:.60}")
@@ -146,7 +151,7 @@ def make_weight(part: Part[Any], block: Block) -> Array:
     who, shape = f"{part.use} of block {block.name}", (block.size, block.size)
     try:
         weight = np.asarray(law.weight(block), dtype=np.float64)
-    except Exception as error:
+    except PART_ERRORS as error:
         raise part.raised(f" of block {block.name}", "weight", error) from error
     if weight.shape != shape:
         raise PartRunError(f"{who}: weight has the shape {weight.shape}, not {shape}")
@@ -166,7 +171,7 @@ def _checked(nu: Nu, part: Part[Any], block: Block) -> Nu:
         try:
             given = nu(t, e, e_dot, feed_forward, state)
             answer = np.asarray(given, dtype=np.float64)
-        except Exception as error:
+        except PART_ERRORS as error:
             if diverged:
                 return np.full(size, np.nan)
             raise part.raised(f" of block {block.name}", f"nu at t = {t:g} s", error) from error

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
@@ -108,7 +108,8 @@ def _table(text: str, name: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{name}: not TOML: {error}") from None
+        hint = _THERE_ALREADY if str(error).startswith(_TWICE) else ""
+        raise ScenarioError(f"{name}: not TOML: {error}{hint}") from None
     except RecursionError:
         raise ScenarioError(f"{name}: not TOML that can be read: nested too deep") from None
     except ValueError:  # Python limits the number of digits of an integer
@@ -119,6 +120,12 @@ class OverrideError(ValueError):
     """An override that cannot be applied."""
 
 
+_TWICE: Final = ("Cannot overwrite a value", "Cannot mutate immutable namespace", "Cannot declare")
+"""How tomllib begins its message about a key or table that is given a second time"""
+_THERE_ALREADY: Final = (
+    "; this key or table is there already: change it at its first place (a table in braces cannot be added to: "
+    "write it as [table])"
+)
 _INDEX = re.compile(r"\s*\[\s*([0-9]{1,9})\s*\](?=\s*(?:[.\[]|$))")
 """The number of an array's entry in brackets, at the end of a chunk of a key"""
 

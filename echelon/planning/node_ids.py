@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from echelon.plan.can_plan import Addressing
 from echelon.plan.plan import PlanError
-from echelon.plugins import Part
+from echelon.plugins import PART_ERRORS, Part
 
 MAX_IDENTIFIER: Final = 0x7FF
 SHOWN: Final = 8
@@ -53,8 +53,8 @@ def ask(part: Part[Any], key: str, method: str, *arguments: Any) -> Any:
     """Calls a method of a protocol and returns its answer.  Raises PlanError if the method raises, as a user's protocol may."""
     try:
         return getattr(part.made, method)(*arguments)
-    except Exception as error:
-        raise PlanError(f"{key}.protocol: {part.use}: {method} raised {type(error).__name__}: {error}") from None
+    except PART_ERRORS as error:
+        raise PlanError(f"{key}.protocol: {part.raised('', method, error)}") from None
 
 
 def choose_nodes(places: Sequence[Place]) -> dict[int, tuple[int, int]]:
@@ -97,7 +97,7 @@ class _Bus:
             if place.robot not in nodes:
                 raise PlanError(f"{place.key}.protocol = {use!r}: has no place for robot number {place.robot}")
             if found := self._take(self._identifiers(place, place.robot), f"those of {place.path}"):
-                raise PlanError(f"{_collision(place, found)}; give another bus")
+                raise PlanError(f"{_collision(place, found)}; {self._same(place) or 'give another bus'}")
         return {place.robot: (place.robot, place.robot) for place in places}
 
     def _given(self, places: Sequence[Place]) -> dict[int, tuple[int, int]]:
@@ -119,7 +119,8 @@ class _Bus:
             free = self._free(place)
             more = ", …" if len(free) > SHOWN else ""
             shown = f"free are {', '.join(map(str, free[:SHOWN]))}{more}" if free else "none is free"
-            raise PlanError(f"{_collision(place, found)}; {shown}; or give another bus")
+            more = self._same(place) or f"{shown}; or give another bus"
+            raise PlanError(f"{_collision(place, found)}; {more}")
         return chosen
 
     def _lowest(self, places: Sequence[Place]) -> dict[int, tuple[int, int]]:
@@ -129,10 +130,8 @@ class _Bus:
             nodes = []
             for _ in place.addressing.wheels:
                 if not (free := self._free(place)):
-                    raise PlanError(
-                        f"{place.key}.node_ids: {_needed(place)} for {place.protocol.use}, and no more are free; put some "
-                        "robots on another bus (can.buses)"
-                    )
+                    more = self._same(place) or "put some robots on another bus (can.buses)"
+                    raise PlanError(f"{place.key}: no node id is free for a drive of {place.protocol.use}; {more}")
                 nodes.append(free[0])
                 self._take(self._identifiers(place, free[0]), f"those of {place.path}")
             chosen[place.robot] = nodes[0], nodes[-1]
@@ -156,6 +155,14 @@ class _Bus:
         """Returns the node ids whose identifiers are all free, in ascending order."""
         nodes = (node for node in place.addressing.nodes if node)
         return [node for node in nodes if self._users.keys().isdisjoint(self._identifiers(place, node))]
+
+    def _same(self, place: Place) -> str:
+        """Returns a text about the identifier that a protocol names for every node id; "" if there is none."""
+        nodes = place.addressing.nodes
+        same = frozenset.intersection(*(self._identifiers(place, node) for node in nodes))
+        if not same or len(nodes) < 2:
+            return ""
+        return f"its identifiers(node) names {min(same):#05x} for every node; each node needs its own"
 
     def _spread(self, place: Place) -> int:
         """Returns the difference between the largest and the smallest identifier of a node."""
@@ -186,5 +193,6 @@ def _collision(place: Place, found: tuple[int, str]) -> str:
 def _needed(place: Place) -> str:
     """Returns the text about how many node ids a robot's drives need, and from which range."""
     nodes = place.addressing.nodes
-    count = "one, twice," if len(place.addressing.wheels) == 1 else "two different ones"
-    return f"{count} from {nodes[0]} to {nodes[-1]} are needed"
+    if len(place.addressing.wheels) == 1:
+        return f"one from {nodes[0]} to {nodes[-1]}, written twice, is needed"
+    return f"two different ones from {nodes[0]} to {nodes[-1]} are needed"

@@ -57,6 +57,11 @@ class Child:
         return self.spec.name
 
     @property
+    def kind_and_name(self) -> str:
+        """The kind and the name of the process, as `robot g1/r1`; once if they are the same."""
+        return self.name if self.name == self.spec.kind else f"{self.spec.kind} {self.name}"
+
+    @property
     def is_member(self) -> bool:
         """True: it ends by itself when the run is over.  False: it waits for the order to finish."""
         return self.spec.member
@@ -86,13 +91,22 @@ class Child:
         return runs_text(self.spec.plan, self.spec.index) if self.spec.kind in ROLES else ""
 
     def state(self) -> str:
-        """Returns the kernel's state of the process: running, sleeping, stopped, …"""
-        try:
-            text = Path(f"/proc/{self.process.pid}/status").read_text()
-        except OSError:
-            return "gone"
-        state = next((line for line in text.splitlines() if line.startswith("State:")), "State: ? (unknown)")
-        return state.partition("(")[2].rstrip(")")
+        """Returns the kernel's state of the process: running, sleeping, stopped, …
+
+        It is running if one of its threads is: a role works in Zenoh's thread while the main thread sleeps."""
+        states = list(_thread_states(self.process.pid or 0))
+        return "running" if "running" in states else states[0] if states else "gone"
+
+
+def _thread_states(pid: int) -> Iterator[str]:
+    """Yields the kernel's states of a process's threads, the main thread's first; nothing if there is no such process."""
+    try:
+        for thread in sorted(Path(f"/proc/{pid}/task").iterdir(), key=lambda path: int(path.name)):
+            text = (thread / "status").read_text()
+            state = next((line for line in text.splitlines() if line.startswith("State:")), "State: ? (unknown)")
+            yield state.partition("(")[2].rstrip(")")
+    except OSError:
+        return
 
 
 def last_words_of(children: Sequence[Child]) -> str:

@@ -45,9 +45,19 @@ class StallWatch:
         still_s = now_s - self._moved_s
         if still_s > STALL_REPORT_S and not self._warned:
             self._warned = True
-            self._progress.note = f"stalled at t = {self._progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
+            self._progress.note = (
+                f"stalled at t = {self._stands_at_ns(now_s) / 1e9:g} s: {self._who_is_waited_for(now_s)}"
+            )
         if still_s > self._stall_timeout_s:
             raise StallError(still_s, self._who_is_waited_for(now_s))
+
+    def _stands_at_ns(self, now_s: float) -> int:
+        """Returns the instant [ns] at which the run stands: the first one at which a member waits.  What is recorded may be
+        older, for copies of messages come in batches."""
+        waits = [
+            child.waiting_ns for child in self._children if child.waiting_for and now_s - child.heard_s <= SILENT_S
+        ]
+        return max(self._progress.time_ns, min(waits, default=0))
 
     def _who_is_waited_for(self, now_s: float) -> str:
         """Returns in words which processes everyone waits for: the silent ones, or else who waits for whom.

@@ -214,9 +214,7 @@ class Supervisor:
             case Failed():
                 starting = progress.phase == "starting"
                 raise RunError(
-                    f"{child.spec.kind} {child.name} cannot start: {said.text}"
-                    if starting
-                    else f"{child.name}: {said.text}"
+                    f"{child.kind_and_name} cannot start: {said.text}" if starting else f"{child.name}: {said.text}"
                 )
             case PartFailed():
                 raise RunError(said.text)
@@ -232,7 +230,7 @@ class Supervisor:
                 if child.done is None:
                     if not child.words.closed:
                         child.hear_words()
-                    raise RunError(f"lost {child.spec.kind} {child.name} ({child.ending()}){last_words_of([child])}")
+                    raise RunError(f"lost {child.kind_and_name} ({child.ending()}){last_words_of([child])}")
 
     def _say(self, note: str) -> None:
         """Shows a note to the user."""

@@ -107,7 +107,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: i
     def cell(at: int, value: object) -> str:
         if isinstance(value, bool):
             return f'<td class="mark {"holds" if value else "fails"}">{"holds" if value else "fails"}</td>'
-        if value in OUTCOMES:
+        if at and value in OUTCOMES:  # the first cell names the row
             return f'<td class="mark {OUTCOMES[str(value)]}">{value}</td>'
         text = number(value) if isinstance(value, float) or value is None else str(value)
         kind = " class=n" if at >= numeric_from else " class=w" if len(text) > LONG else ""

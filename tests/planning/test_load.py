@@ -436,6 +436,19 @@ def test_files_that_are_not_scenarios(tmp_path, content, line):
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    "more", ["name = 'x'\n", "robot.mass = 2.0\n", "[robot]\nmass = 2.0\n", "robot = { mass = 2.0 }\n", "[name]\n"]
+)
+@pytest.mark.parametrize("robot", ["robot = { mass = 4.0 }\n", "[robot]\nmass = 4.0\n[robot.drive]\n"])
+def test_a_key_that_is_there_already_is_said_to_be_there(robot, more):
+    text = f"name = 'x'\n{robot}"
+    if robot.startswith("[") and "[" not in more:  # at the end it would be a key of the last table
+        text = f"{more}{text}"
+    with pytest.raises(ScenarioError, match="is there already: change it at its first place") as caught:
+        parse(text if text.startswith("robot.") or text.count("name = ") > 1 else text + more, "t.toml")
+    assert len(str(caught.value).splitlines()) == 1
+
+
 def test_files_that_cannot_be_read(tmp_path):
     for path, line in (
         (tmp_path, "Is a directory"),

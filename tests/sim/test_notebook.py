@@ -183,6 +183,29 @@ def test_no_command_is_no_torque() -> None:
     assert not simulation.states["v"].any()
 
 
+@pytest.mark.parametrize("wrong", [(np.nan, 0.0), (0.0, np.nan), (np.inf, 0.0), (np.nan, -np.inf)])
+def test_half_a_command_is_a_mistake(wrong: tuple[float, float]) -> None:
+    simulation = echelon.Simulation("lab", {"duration": 0.1, "claims": []})
+    simulation.commands[4] = wrong
+    with pytest.raises(echelon.UserError, match=r"commands\[4\] = \[.*\], of g2/r5: must be two finite numbers"):
+        simulation.step()
+    simulation.commands[4] = 0.1, 0.0  # nothing has moved, and it goes on
+    assert simulation.t == 0.0
+    assert simulation.step() == pytest.approx(0.01)
+
+
+class Mine(echelon.Law):
+    def nu(self, block, t, e, e_dot, feed_forward, state):  # type: ignore[no-untyped-def]
+        return feed_forward
+
+
+@pytest.mark.parametrize("use", [Mine, Mine()])
+def test_a_class_is_not_a_value_of_a_scenario(use: object) -> None:
+    for scenario, changes in (("lab", {"law.use": use}), ("lab", {"law": {"use": use}}), ({"law": {"use": use}}, None)):
+        with pytest.raises(echelon.UserError, match=r"Mine: .* write it into a file .* and give 'my_laws\.py:Mine'$"):
+            echelon.load(scenario, changes)  # type: ignore[arg-type]
+
+
 def test_errors_and_states_are_those_of_the_instant() -> None:
     simulation = echelon.Simulation("lab", {"duration": 0.2, "claims": []})
     simulation.run_until(0.1)

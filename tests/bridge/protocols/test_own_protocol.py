@@ -196,6 +196,11 @@ def observed(plan: Plan) -> object:
             "observe must return a list of Finding",
         ),
         (
+            failing("observe", "raise SystemExit(3)", "MyObserver(CyclicObserver)"),
+            observed,
+            "its observer's observe raised SystemExit: 3",
+        ),
+        (
             failing("observe", "self.wheels[0].reported = 'much'", "MyObserver(CyclicObserver)"),
             observed,
             "its observer reads a torque that is no finite number: 'much'",
@@ -209,6 +214,16 @@ def test_what_returns_no_frames_is_named(folder: Path, change: tuple[str, str], 
         ask(plan)
     assert re.match(r"my_drive\.py(:|, line \d+: )MyProtocol of r1: ", str(caught.value))
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("given", [[], ["formation.robots.r1.drive.node_ids=[1,1]"]])
+def test_node_ids_that_change_nothing_are_the_mistake(folder: Path, given: list[str]) -> None:
+    scenario = changed(folder, ("by_number = True", "by_number = False"), ("COMMAND + node, F", "COMMAND, F"))
+    with pytest.raises(
+        ScenarioError, match=r"identifiers\(node\) names 0x300 for every node; each node needs its own"
+    ) as e:
+        load(scenario, given)
+    assert "are needed" not in str(e.value)
 
 
 @pytest.mark.parametrize(
@@ -247,7 +262,11 @@ HOST = "    def host(self, drive: DrivePlan) -> MyHost:\n        return MyHost(d
         ("return frozenset((", "return list((", "identifiers must be a set of numbers from 0 to 0x7ff, not [768"),
         ("FEEDBACK = 0x300, 0x380", "FEEDBACK = 0x300, 0x7FE", "from 0 to 0x7ff, not frozenset({"),
         ("0x380  # each", "0x301  # each", "identifier 0x301 of r2 collides with those of r1; give another bus"),
-        ("by_number = True", "by_number = False", "node_ids = [1, 2]: one, twice, from 0 to 126 are needed"),
+        ("COMMAND + node, FEEDBACK + node)", "COMMAND, FEEDBACK)", "its identifiers(node) names 0x300 for every node"),
+        ("return frozenset((COMMAND + node", "raise SystemExit(3) or frozenset((COMMAND + node",
+         "my_drive.py, line 91: MyProtocol: identifiers raised SystemExit: 3"),
+        ("        return MyHost(drive", "        exit(3); return MyHost(drive", "host raised SystemExit: 3"),
+        ("by_number = True", "by_number = False", "node_ids = [1, 2]: one from 0 to 126, written twice, is needed"),
         ("        return [\n            Message(", "        return [Message(1, 'a', 8, [])] + [\n            Message(",
          "messages describes identifier 0x001, which `identifiers` does not name"),
         ("        return [\n            Message(COMMAND", "        return [] and [\n            Message(COMMAND",

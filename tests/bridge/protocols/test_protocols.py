@@ -132,7 +132,7 @@ def test_mistakes_name_what_is_allowed(overrides: tuple[str, ...], says: str) ->
 def test_a_bus_that_is_full_of_nodes_says_so() -> None:
     robots = "".join(f"r{n}={{start=[{n}.0,0.0]}}," for n in range(32))
     text = "robots={" + robots[:-1] + '},shape={kind="line",spacing=1.0}'
-    with pytest.raises(ScenarioError, match="no more are free; put some robots on another bus"):
+    with pytest.raises(ScenarioError, match="no node id is free for a drive of odrive; put some robots on another bus"):
         lab(f"formation={{{text}}}", ODRIVES, "law={}", "claims=[]")
 
 

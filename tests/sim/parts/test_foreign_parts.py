@@ -104,13 +104,14 @@ def one_line(err: str) -> str:
     ("line", "says"),
     [
         ("raise KeyError('w')", "raised KeyError: 'w'"),
+        ("__import__('sys').exit()", "raised SystemExit"),
         ("raise ValueError('first\\nsecond')", "raised ValueError: first\\nsecond"),
         ("return None", {"plant": "must return a RobotState", "path": "has the shape ()", "law": "returned nothing"}),
         ("return [1.0]", {"plant": "must return a RobotState", "path": "has the shape (1,)", "law": "has the shape (1,)"}),
         (HANG, "takes longer than 0.5 s"),
         ("while True:\n            try:\n                pass\n            except Exception:\n                pass", "longer"),
     ],
-    ids=["raises", "two lines", "nothing", "shape", "hangs", "hangs and swallows"],
+    ids=["raises", "exits", "two lines", "nothing", "shape", "hangs", "hangs and swallows"],
 )  # fmt: skip
 def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
     folder: Path, kind: str, line: str, says: str | dict[str, str], monkeypatch: pytest.MonkeyPatch
@@ -282,6 +283,14 @@ def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way
     assert echelon("report", folder / "run").returncode == 0
     if "closed" in way:
         wheels_are_at_zero(folder / "run")
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+@pytest.mark.parametrize("way", ["in process", "processes"])
+def test_a_part_that_exits_in_a_run_fails_by_name(folder: Path, kind: str, way: str) -> None:
+    done = run(folder, write(folder, kind, f"{LATER[kind]} exit(0)"), *WAYS[way])
+    assert done.returncode == 3
+    assert one_line(done.stderr) == f"echelon: {NAMED[kind]}raised SystemExit: 0"
 
 
 @pytest.mark.parametrize("way", ["in process", "processes"])

@@ -66,7 +66,8 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
             folder = stack.enter_context(out_folder(scenario.name, options.out, files, options.replace))
         except OSError as error:
             if options.out is not None:
-                raise UsageError(f"--out {options.out}: {error.strerror}") from None
+                why = "is a file, and must be a folder" if isinstance(error, FileExistsError) else error.strerror
+                raise UsageError(f"--out {options.out}: {why}") from None
             raise UsageError(f"{error.filename}: {error.strerror}; give a folder with --out") from None
         return _run_in(folder, scenario, plan, options, urls)
 

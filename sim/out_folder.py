@@ -1,8 +1,9 @@
 """The folder that a run writes into.  Only files that an earlier run wrote are ever overwritten or deleted there.
 
-A run notes in `.echelon.json` which files it writes.  The next run of the same scenario in the folder deletes these.  For files
-that people may edit (the scenario, users' parts) the note also holds their SHA-256: a file that was edited is not deleted.  The
-folder is locked while a run writes into it.
+A run notes in `.echelon.json` which files it writes, and when it ends the SHA-256 of each.  The next run of the same scenario
+in the folder deletes those that have this hash still.  A run that was killed has noted hashes of the scenario and of users'
+parts alone; its other files count as its own by their names.  Without the note nothing counts as written by a run.  The folder
+is locked while a run writes into it.
 
 file in the folder                          a new run of the same scenario   a new run of another scenario
 written by an earlier run, unchanged        deletes it                       is refused, or with `replace` deletes it
@@ -12,12 +13,11 @@ not written by a run                        is refused if it needs the name  is 
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +27,6 @@ from echelon.errors import UsageError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
-from echelon.sim.recording.mcap_reader import read_metadata, read_scenario
 from echelon.sim.run_state import STATE
 
 NOTE: Final = ".echelon.json"
@@ -58,12 +57,19 @@ class OutFolder:
     _files: dict[str, str | None] = field(default_factory=dict)
 
     def note(self, files: Iterable[str], texts: Mapping[str, str]) -> None:
-        """Notes the files of the run: names in `files`, and in `texts` files that people may edit, with the run's texts.
+        """Notes the files of the run: names in `files`, and in `texts` files that are written at its start, with their texts.
 
         Raises OSError."""
         self._files |= dict.fromkeys(files)
         self._files |= {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}
-        write_text(self.path / NOTE, json.dumps({"scenario": self.scenario, "files": self._files}, indent=1) + "\n")
+        _write_note(self.path, self.scenario, self._files)
+
+    def seal(self) -> None:
+        """Notes the hashes of all files that have none yet: the run writes no more.  Raises OSError."""
+        for name, digest in self._files.items():
+            if digest is None and (self.path / name).is_file():
+                self._files[name] = _hash(self.path / name)
+        _write_note(self.path, self.scenario, self._files)
 
 
 @contextmanager
@@ -83,9 +89,31 @@ def out_folder(scenario: str, out: Path | None, files: Iterable[str], replace: b
         _clear(path, scenario, files, replace)
         folder = OutFolder(path, scenario, tuple(_misleading(path)))
         folder.note(files, {})
-        yield folder
+        try:
+            yield folder
+        finally:
+            with suppress(OSError):  # the files then count as those of a run that was killed
+                folder.seal()
     finally:
         os.close(held)
+
+
+def note_again(path: Path, names: Iterable[str]) -> None:
+    """Notes the hashes of files of a finished run that were written anew, and of those that have none yet; does nothing in a
+    folder without the note of a run.  Raises OSError."""
+    if earlier := _earlier(path):
+        scenario, files = earlier
+        anew = {*names, *(name for name, digest in files.items() if digest is None and (path / name).is_file())}
+        _write_note(path, scenario, files | {name: _hash(path / name) for name in sorted(anew)})
+
+
+def _write_note(path: Path, scenario: str, files: Mapping[str, str | None]) -> None:
+    write_text(path / NOTE, json.dumps({"scenario": scenario, "files": files}, indent=1) + "\n")
+
+
+def _hash(file: Path) -> str:
+    with file.open("rb") as opened:
+        return file_digest(opened, "sha256").hexdigest()
 
 
 def _new(scenario: str) -> Path:
@@ -112,13 +140,17 @@ def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> No
     for name, digest in earlier[1].items() if earlier else ():
         file = path / name
         if file.is_file():
-            if digest is None or sha256(file.read_bytes()).hexdigest() == digest:
+            if digest is None or _hash(file) == digest:
                 left[name] = file
             else:
                 edited.add(name)
     for name in files:
         if name not in left and os.path.lexists(path / name):
-            why = "was changed after its run" if name in edited else "exists, and no run of echelon wrote it"
+            why = (
+                "was changed after its run"
+                if name in edited
+                else f"exists, and {NOTE} does not say that a run wrote it"
+            )
             raise UsageError(f"--out {path}: {name} {why}; move it away, or give another folder")
     if earlier and left and earlier[0] != scenario and not replace:
         what = f"holds a run of the scenario {earlier[0]}, not {scenario}"
@@ -128,24 +160,13 @@ def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> No
 
 
 def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
-    """Returns the scenario's name and the files of the run in a folder, with their SHA-256 or None; None if there is no run."""
+    """Returns the scenario's name and the files of the run in a folder, with their SHA-256 or None; None without a note."""
     try:
         note = json.loads((path / NOTE).read_text(encoding="utf-8"))
         files = {str(name): digest for name, digest in note["files"].items() if Path(name).name == name}
         return str(note["scenario"]), files
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        pass
-    # There is no note, for example in a copy of the folder: the recording says what was run.
-    scenario, files = "", dict[str, str | None]()
-    for recording in (path / CUT, path / RECORDING):
-        with suppress(OSError, ValueError, KeyError):
-            toml, metadata = read_scenario(recording), read_metadata(recording)
-            buses = tomllib.loads(toml)["can"]["buses"]
-            scenario = metadata["scenario"]
-            files |= dict.fromkeys((recording.name, STATE, SUMMARY, REPORT, LOG, "torque.dbc"))
-            files |= dict.fromkeys(f"torque-{bus}.dbc" for bus in buses)
-            files[EFFECTIVE] = sha256(toml.encode()).hexdigest()
-    return (scenario, files) if files else None
+        return None
 
 
 def _misleading(path: Path) -> Iterator[str]:

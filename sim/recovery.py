@@ -18,7 +18,7 @@ from echelon.errors import UserError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
-from echelon.sim.out_folder import CUT, RECORDING, REPORT, SUMMARY
+from echelon.sim.out_folder import CUT, RECORDING, REPORT, SUMMARY, note_again
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import (
     RecoverResult,
@@ -58,7 +58,10 @@ def recover_run(folder: Path) -> Recovered:
     except BlockingIOError:
         raise UserError(f"{folder}: a run is going on there") from None
     try:
-        return _recover(folder)
+        recovered = _recover(folder)
+        if recovered.files:
+            note_again(folder, recovered.files)
+        return recovered
     finally:
         os.close(held)
 

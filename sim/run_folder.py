@@ -25,6 +25,8 @@ FRAMES: Final = 18
 
 def open_run(folder: Path) -> Run:
     """Returns the run in a folder.  Raises UserError if a file of it is missing, damaged or not readable."""
+    if not any((folder / name).exists() for name in (EFFECTIVE, "run.mcap", "summary.json")):
+        raise UserError(f"{folder}: is not the folder of a run")
     try:
         _, plan = load(folder / EFFECTIVE, trial=False)
         summary = read_summary(folder / "summary.json")

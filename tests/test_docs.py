@@ -2,11 +2,14 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from echelon.cli.new_scenario import scenario_text, sizes
 from echelon.cli.parser import make_parser
+from echelon.scenario.tables import Scenario
 from support.runs import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -55,6 +58,28 @@ def test_docstrings_cite_sections_that_exist() -> None:
 def test_no_docstring_points_outside_the_repository() -> None:
     for path in SOURCES:
         assert "theory.md" not in path.read_text(encoding="utf-8"), path
+
+
+def tables(page: Path) -> list[str]:
+    """Returns the pieces of scenarios on a page that begin with a table."""
+    blocks = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    return [block for block in blocks if block.startswith("[") and not block.startswith("[project")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_of_the_pages_can_be_added_to_the_scenario_of_the_readme(page: Path) -> None:
+    """`[law]` and `[trajectory]` take the place of those that are there."""
+    mine = (ROOT / "README.md").read_text(encoding="utf-8").split("```toml\n", 1)[1].split("```", 1)[0]
+    for table in tables(page):
+        replaced = [name for name in ("law", "trajectory") if f"[{name}]" in table]
+        kept = re.sub(rf"^\[({'|'.join(replaced) or '-'})\]\n.*?(?=^\[)", "", mine, flags=re.DOTALL | re.MULTILINE)
+        known = Scenario.model_fields
+        assert set(tomllib.loads(f"{kept}\n{table}")) <= set(known), table
+
+
+def test_a_new_scenario_has_the_tables_that_pages_name() -> None:
+    text = scenario_text("mine", sizes("2x3"), "odrive")
+    assert {"[robot]", "[law]", "[trajectory]", "[robot.drive]", "[robot.envelope]"} <= set(text.splitlines())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

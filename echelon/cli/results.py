@@ -37,6 +37,7 @@ class ReportOptions:
 
 def report(options: ReportOptions) -> int:
     """Writes the report of a run, or a comparison of several; or its figures, each as a file."""
+    from echelon.sim.out_folder import REPORT, note_again
     from echelon.sim.report.report import save_figures, write_report
     from echelon.sim.run_folder import runs_for_report
 
@@ -46,13 +47,15 @@ def report(options: ReportOptions) -> int:
     if path is None and options.figures is None:
         path = options.runs[0] / "report.html" if len(options.runs) == 1 else Path("report.html")
         if not _may_replace(path):
-            raise UsageError(f"{path}: exists, and echelon did not write it; give another file with --out")
+            raise UsageError(f"{path}: exists, and is no report of echelon; give another file with --out")
     runs, written = runs_for_report(options.runs), list[Path]()
     try:
         if options.figures is not None:
             written = save_figures(runs, options.figures, options.format or ("svg",))
         if path is not None:
             write_report(runs, path)
+            if path.name == REPORT:
+                note_again(path.parent, [REPORT])
     except OSError as error:
         raise UsageError(f"{error.filename or path}: {error.strerror}") from None
     if options.json:

@@ -96,6 +96,7 @@ def validate(options: ValidateOptions) -> int:
     from echelon.bridge.timing.fit import describe_fit
     from echelon.cli.scenario_file import read_scenario
     from echelon.sim.forecast.warnings import warnings
+    from echelon.sim.results.verdict import count
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
     facts: dict[str, Any] = {
@@ -113,7 +114,8 @@ def validate(options: ValidateOptions) -> int:
         print(json.dumps(facts, indent=2, ensure_ascii=False))
         return code
     print(f"{options.scenario}: valid")
-    print(f"  {facts['robots']} robots under {len(plan.nodes)} nodes, {facts['duration']:g} s, {facts['ticks']} ticks")
+    members = f"{count(facts['robots'], 'robot')}, {count(facts['groups'], 'leader')}, 1 coordinator"
+    print(f"  {members}, {facts['duration']:g} s, {count(facts['ticks'], 'tick')}")
     print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
     for line in facts["can"]:
         print(f"  CAN  {line}")

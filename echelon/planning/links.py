@@ -230,7 +230,8 @@ def _tree_links(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan]) -> list[
 
 def _no_member(key: str, pattern: str, names: Sequence[str]) -> str:
     """Returns the text that says that a pattern fits no member."""
-    shown = ", ".join(reversed(names[-SHOWN_NAMES:]))
+    from_the_root = sorted(names, key=lambda name: (name != "coordinator", name.count("/")))
+    shown = ", ".join(from_the_root[:SHOWN_NAMES])
     more = f", and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
     return f"{key} = {pattern!r}: fits no member; there are {shown}{more}"
 

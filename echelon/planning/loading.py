@@ -210,7 +210,10 @@ def _index(array: list[Any], chunk: str) -> int:
     """Returns the index that a chunk of a key stands for: of an entry, or of the next entry to be added.  Raises
     OverrideError."""
     if not _is_number(chunk) or int(chunk) > len(array):
-        raise OverrideError(f"{short(chunk)} must be a number from 0 to {len(array)}, for an entry or the next one")
+        allowed = (
+            f"a number from 0 to {len(array)}, for an entry or the next one" if array else "0, for the first entry"
+        )
+        raise OverrideError(f"{short(chunk)} must be {allowed}")
     return int(chunk)
 
 

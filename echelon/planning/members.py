@@ -238,7 +238,9 @@ def _shape(shape: Shape | None, count: int, key: str) -> ShapePlan:
         kind, needed = "vectors", count - 1
     if len(points) != needed:
         what = f"{shape.kind}: " if shape.kind in ("points", "vectors") else f"kind = {shape.kind!r}: "
-        raise PlanError(f"{key}.{what}{len(points)} of them do not fit a group of {count}, which takes {needed}")
+        noun = "vector" if kind == "vectors" else "place"
+        gives = f"{len(points)} {noun}{'' if len(points) == 1 else 's'}"
+        raise PlanError(f"{key}.{what}gives {gives}; a group of {count} needs {needed}")
     turned = tuple(shapes.rotated(points, shape.rotation))
     if not all(isfinite(number) for point in turned for number in point):
         raise PlanError(f"{key}: too large to be computed with")

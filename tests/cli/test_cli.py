@@ -126,7 +126,7 @@ def test_plain_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
         (("run", "paper", "--set", "duration"), "key=value"),
         (("run", "paper", "--can", "serial:1"), "serial"),
         (("run", "paper", "--can", "socketcan:nope"), "no network interface nope that is up"),
-        (("run", "paper", "--out", "pyproject.toml"), "--out pyproject.toml: File exists"),
+        (("run", "paper", "--out", "pyproject.toml"), "--out pyproject.toml: is a file, and must be a folder"),
         (("run", "paper", "--out", "/proc/nowhere"), "--out /proc/nowhere"),
         (("report", "no-such-run"), "no-such-run"),
         (("export", "no-such-run", "--csv", "x"), "no-such-run"),
@@ -309,7 +309,7 @@ def test_a_report_overwrites_reports_alone_unless_it_is_told_to(folder: Path, tm
     page = tmp_path / "report.html"
     page.write_text("<html>mine</html>")
     done = echelon("report", folder, folder, cwd=tmp_path)
-    says = "echelon: report.html: exists, and echelon did not write it; give another file with --out\n"
+    says = "echelon: report.html: exists, and is no report of echelon; give another file with --out\n"
     assert (done.returncode, done.stderr) == (2, says)
     assert page.read_text() == "<html>mine</html>"
     for arguments in (("--out", "report.html"), ()):

@@ -41,6 +41,9 @@ def left(lab: Path, tmp_path: Path) -> Path:
 
 
 def test_of_an_earlier_run_of_the_same_scenario_nothing_stays(left: Path) -> None:
+    note = json.loads((left / NOTE).read_text())
+    note["files"] |= dict.fromkeys(("run.mcap.cut", "can.log"))  # as a run leaves it that was killed
+    (left / NOTE).write_text(json.dumps(note))
     (left / "run.mcap.cut").write_text("of a run that was killed")
     assert run(left, "lab", "--can", "none") == (0, "")
     assert set(files(left)) == {NOTE, "scenario.toml", "run.json", "run.mcap", "summary.json"}
@@ -67,7 +70,9 @@ def test_a_file_in_the_way_stays_as_it_is(name: str, replace: bool, tmp_path: Pa
 
 def test_a_scenario_in_the_way_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "scenario.toml").write_text("mine")
-    says = "scenario.toml exists, and no run of echelon wrote it; move it away, or give another folder"
+    says = (
+        "scenario.toml exists, and .echelon.json does not say that a run wrote it; move it away, or give another folder"
+    )
     assert run(".", "lab", "--replace", cwd=tmp_path) == (2, f"echelon: --out .: {says}\n")
     assert files(tmp_path) == {"scenario.toml": b"mine"}
 
@@ -89,28 +94,43 @@ def test_a_project_keeps_its_files(tmp_path: Path) -> None:
     assert mine.items() <= files(tmp_path).items()
 
 
-def test_a_scenario_that_was_edited_in_the_folder_of_its_run_is_the_users(left: Path) -> None:
-    scenario = left / "scenario.toml"
-    assert run(left, scenario) == (0, "")
-    scenario.write_text(scenario.read_text() + "# mine\n")
+@pytest.mark.parametrize("name", ["scenario.toml", "run.json", "run.mcap", "summary.json", "can.log", "torque.dbc"])
+def test_a_file_that_was_edited_since_its_run_is_the_users(left: Path, name: str) -> None:
+    assert run(left) == (0, "")
+    with (left / name).open("ab") as file:
+        file.write(b" ")
     before = files(left)
-    says = f"echelon: --out {left}: scenario.toml was changed after its run; move it away, or give another folder\n"
-    assert run(left, scenario) == (2, says)
+    says = f"echelon: --out {left}: {name} was changed after its run; move it away, or give another folder\n"
+    assert run(left, "lab") == run(left, "lab", "--replace") == (2, says)
     assert files(left) == before
 
 
-def test_a_copy_without_the_note_is_known_by_its_recording(left: Path) -> None:
-    (left / NOTE).unlink()
-    assert "holds a run of the scenario lab, not paper" in run(left, "paper")[1]
-    (left / "scenario.toml").write_text("mine")
-    assert "scenario.toml was changed after its run" in run(left)[1]
-    shutil.copy(left / "run.mcap", left / "run.mcap.cut")
-    (left / "run.mcap").write_text("mine")
-    (left / "scenario.toml").unlink()
-    assert "run.mcap exists, and no run of echelon wrote it" in run(left)[1]
-    (left / "run.mcap").unlink()
+def test_a_file_that_is_not_needed_stays_if_it_was_edited(left: Path) -> None:
+    for name in ("can.log", "torque.dbc"):
+        (left / name).write_text("mine")
+    assert run(left, "lab", "--can", "none")[0] == 0
+    assert (left / "can.log").read_text() == (left / "torque.dbc").read_text() == "mine"
+
+
+def test_what_report_and_recover_write_is_of_the_run(left: Path) -> None:
+    assert echelon("report", left).returncode == 0
     assert run(left) == (0, "")
-    assert not (left / "run.mcap.cut").exists()
+    (left / "summary.json").unlink()
+    assert echelon("recover", left).returncode == 0
+    assert run(left) == (0, "")
+    assert not (left / "report.html").exists()
+    assert echelon("report", left).returncode == 0
+    (left / "report.html").write_text("mine")
+    assert "report.html was changed after its run" in run(left)[1]
+
+
+def test_a_copy_without_the_note_stays_as_it_is(left: Path) -> None:
+    (left / NOTE).unlink()
+    before = files(left)
+    assert (
+        "scenario.toml exists, and .echelon.json does not say that a run wrote it" in run(left, "lab", "--replace")[1]
+    )
+    assert files(left) == before
 
 
 def test_copies_of_parts_go_with_their_run_unless_they_were_edited(tmp_path: Path) -> None:

@@ -347,6 +347,7 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     assert f" {RUNS[kind]}" in said
     assert "which runs mine.py:Mine" in said
     assert "Traceback" not in done.stderr
+    assert ", running, which runs mine.py:Mine" in said or "processes" not in way
     summary = summary_of(folder / "run")
     assert summary["instants"] > 5
     (reason,) = (reason for reason in reasons(summary) if reason.startswith("stalled"))

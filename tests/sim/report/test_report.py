@@ -21,6 +21,7 @@ from echelon.bridge.reports import (
 )
 from echelon.planning.loading import effective_toml
 from echelon.sim.report.drawing import COLUMNS, thin
+from echelon.sim.report.page import table
 from echelon.sim.report.report import write_report
 from echelon.sim.report.run_for_report import RunForReport
 from echelon.sim.results.summary import summarise
@@ -183,6 +184,12 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
     assert "The run was stopped at 3.5 s; can.log and the numbers of the buses include 4 later frames" in text
     assert "1.5 can0 100 g1/r1 gap <late>" in text
     assert "2 scheduled g1/r1, g1/r2 estop, until 4 s 2.5 can0 g1/r1 bus-off" in text
+
+
+def test_a_row_may_be_called_as_an_outcome_is():
+    assert '<td>failed</td><td class="mark fails">failed</td>' in table(
+        ["", ""], [["failed", "failed"]], numeric_from=2
+    )
 
 
 def test_text_is_escaped(single):

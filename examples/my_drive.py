@@ -64,7 +64,7 @@ class MyDrive(CyclicDrive):  # the virtual drive: both motors, watchdog, faults
     def decode(self, frame: Frame) -> Command | str:
         return read_command(frame.data, self.plan.torque_scale)
 
-    def report(self, torques: tuple[float, float]) -> list[Frame]:
+    def report(self, torques: tuple[float, ...]) -> list[Frame]:
         scale = self.plan.torque_scale
         data = BODY.pack(*(bits(torque, scale) for torque in torques), self.states[0] | self.states[1] << 4)
         return [Frame(FEEDBACK + self.plan.node_ids[0], data)]

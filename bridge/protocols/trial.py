@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from echelon.bridge.protocols.checked import Caller
-from echelon.bridge.protocols.frame import WHEELS, Host
+from echelon.bridge.protocols.cyclic import CyclicDrive, CyclicHost
+from echelon.bridge.protocols.frame import WHEELS, Frame
 from echelon.bridge.protocols.registry import (
     DrivePlace,
     cyclic_of,
@@ -59,7 +60,14 @@ def _try_robot(plan: Plan, robot: RobotPlan) -> None:
         _check_described(caller, "observer", set(cyclic_of(robot, observer, closed)), messages)
     caller.call("messages", _written, messages)
     _number(caller, "resolution", resolution := caller.call("resolution", protocol.resolution, drive))
-    _check_torques(caller, host, messages, resolution)
+    right, left = tried = tuple(bits * (resolution or _TRIED_FLOAT) for bits in _TRIED)
+    _check_torques(caller, "encode", host.mirror(right, left, True), messages, tried, resolution)
+    made, made_host = protocol.drive(drive, 0), protocol.host(drive)
+    if isinstance(made, CyclicDrive):
+        frames = caller.frames("its drive's report", made.report, tried)
+        _check_torques(caller, "report", frames, messages, tried, resolution)
+        if isinstance(made_host, CyclicHost):
+            _check_feedback(caller, made_host, frames, tried, resolution)
     caller.call("boot_ups", lambda: dict(protocol.boot_ups(drive)))
     _check_addresses(caller, caller.call("addresses", protocol.addresses, drive))
 
@@ -81,29 +89,48 @@ def _check_described(caller: Caller, what: str, cyclic: set[int], messages: list
         raise caller.wrong(f"{what}: identifier {lacking[0]:#05x} comes regularly, but `messages` does not describe it")
 
 
-def _check_torques(caller: Caller, host: Host, messages: list[Any], resolution: float) -> None:
-    """Raises PartRunError if the signals tau_right and tau_left [N m] of a command's DBC message differ from the torques.
+def _check_torques(
+    caller: Caller, what: str, frames: list[Frame], messages: list[Any], torques: tuple[float, ...], resolution: float
+) -> None:
+    """Raises PartRunError if the signals tau_right and tau_left [N m] of a DBC message differ from the torques that the method
+    `what` put into frames.
 
     A protocol that names or scales its signals otherwise is not checked."""
-    right, left = (bits * (resolution or _TRIED_FLOAT) for bits in _TRIED)
     described = {message.frame_id: message for message in messages}
-    for frame in host.mirror(right, left, True):
+    for frame in frames:
         message = described.get(frame.can_id)
         if message is None or message.is_multiplexed():
             continue
         signals = {signal.name: signal for signal in message.signals}
-        for wheel, torque in zip(WHEELS, (right, left), strict=True):
+        for wheel, torque in zip(WHEELS, torques, strict=True):
             signal = signals.get(f"tau_{wheel}")
             if signal is None or signal.unit not in (None, "Nm", "N m", "N.m"):
                 continue
             if len(frame.data) < message.length:
                 raise caller.wrong(
-                    f"{message.name}: its DBC describes {message.length} bytes where encode returned {len(frame.data)}"
+                    f"{message.name}: its DBC describes {message.length} bytes where {what} returned {len(frame.data)}"
                 )
             read = message.decode(frame.data, decode_choices=False)[signal.name]
             if not abs(read - torque) <= resolution + 1e-6:
                 raise caller.wrong(
-                    f"{message.name}: its DBC reads {signal.name} = {read:.6g} where encode was given {torque:.6g}"
+                    f"{message.name}: its DBC reads {signal.name} = {read:.6g} where {what} was given {torque:.6g}"
+                )
+
+
+def _check_feedback(
+    caller: Caller, host: CyclicHost, frames: list[Frame], torques: tuple[float, ...], resolution: float
+) -> None:
+    """Raises PartRunError if a host reads other torques from the frames of `report` than `report` was given."""
+    for frame in frames:
+        heard = caller.call("its host's decode", host.decode, frame)
+        if isinstance(heard, str):
+            raise caller.wrong(f"its host's decode refuses a frame of report, {frame.data.hex()}: {heard}")
+        if heard is None:
+            continue
+        for wheel, read, torque in zip(WHEELS, heard.torques, torques, strict=True):
+            if not abs(read - torque) <= resolution + 1e-6:
+                raise caller.wrong(
+                    f"its host's decode reads {read:.6g} for the {wheel} wheel where report was given {torque:.6g}"
                 )
 
 

@@ -32,6 +32,7 @@ PROTOCOLS: dict[str, Callable[[Frame], bool]] = {
     "odrive": lambda frame: frame.can_id & 31 == 2,
     "cia402": lambda frame: frame.can_id & 0x780 == 0x200 and frame.data[:2] == b"\x02\x00",
     "my_drive.py:MyProtocol": lambda frame: frame.data[4] & 4 != 0,
+    "my_wheels.py:MyProtocol": lambda frame: frame.data[2] & 4 != 0,
 }
 """Protocols by their name in a scenario, with a function that recognises an emergency stop in a frame of the host"""
 

@@ -1,4 +1,4 @@
-"""The virtual drive of both wheels of a robot in a cyclic protocol.  Pure: frames and the time in, frames out.
+"""The virtual drive of both wheels of a robot in a cyclic protocol, or of one.  Pure: frames and the time in, frames out.
 
 Each wheel has a state of its own:
 
@@ -15,7 +15,7 @@ other.
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from echelon.bridge.protocols.cyclic.frames import REMOTE, Command, WheelState
@@ -30,15 +30,20 @@ CAUSE_PERSISTS: Final = "cause persists"
 
 
 class CyclicDrive(ABC):
-    """The drive of a robot's wheels.  `motors` are the right and the left one; `identifiers` are those it listens to."""
+    """The drive of a robot's `wheels` (0 right, 1 left), both or one; `identifiers` are those it listens to.
 
-    def __init__(self, plan: DrivePlan, identifiers: Iterable[int]) -> None:
+    `motors`, `states` and `faults`, the torques of `report` and the pairs of a command have the order of `wheels`; with one
+    wheel they hold one value each."""
+
+    def __init__(self, plan: DrivePlan, identifiers: Iterable[int], wheels: Sequence[int] = (0, 1)) -> None:
         self.plan = plan
         self.identifiers = frozenset(identifiers)
-        self.motors: tuple[Motor, ...] = (Motor(plan.motor), Motor(plan.motor))
+        self.wheels = tuple(wheels)
+        self.motors = tuple(Motor(plan.motor) for _ in wheels)
         self.refused: Counter[str] = Counter()
-        self.states = [WheelState.DISABLED, WheelState.DISABLED]
-        self.faults: list[Fault | None] = [None, None]
+        self.states = [WheelState.DISABLED for _ in wheels]
+        self.faults: list[Fault | None] = [None for _ in wheels]
+        self._each = range(len(self.wheels))
         self._silent: set[int] = set()  # wheels at which the fault SILENT was injected
         self._now_ns: int | None = None
         self._feedback_ns = -NEVER_NS  # when the next feedback is due
@@ -50,7 +55,7 @@ class CyclicDrive(ABC):
         """Returns the command in a data frame with one of `identifiers`, or the reason to refuse it.  Never raises."""
 
     @abstractmethod
-    def report(self, torques: tuple[float, float]) -> list[Frame]:
+    def report(self, torques: tuple[float, ...]) -> list[Frame]:
         """Returns the feedback frames of an instant: `torques` [N m], means since the last feedback, and the attributes
         `states` and `faults`."""
 
@@ -72,7 +77,7 @@ class CyclicDrive(ABC):
             return frames
         self._heard_ns = time_ns
         torques, enable, clear, estop = command
-        for wheel in (0, 1):
+        for wheel in self._each:
             if estop:
                 self._fail(time_ns, wheel, Fault.ESTOP)
             else:
@@ -96,12 +101,11 @@ class CyclicDrive(ABC):
                 if fault is not None:
                     self._fail(at_ns, wheel, fault)
             if expires_ns <= at_ns:
-                for wheel in (0, 1):
+                for wheel in self._each:
                     if self.states[wheel] is WheelState.ENABLED:
                         self._fail(at_ns, wheel, Fault.WATCHDOG)
             if self._feedback_ns <= at_ns:
-                right, left = self.motors
-                torques = right.mean_torque(at_ns), left.mean_torque(at_ns)
+                torques = tuple([motor.mean_torque(at_ns) for motor in self.motors])
                 if not self._silent:
                     frames += self.report(torques)
                 self._feedback_ns += self.plan.period_ns
@@ -118,18 +122,19 @@ class CyclicDrive(ABC):
             self._silent.add(wheel)
             for motor in self.motors:
                 motor.cut(time_ns)
-            self.states = [WheelState.DISABLED, WheelState.DISABLED]
+            self.states = [WheelState.DISABLED for _ in self.wheels]
         else:
-            self.motors[wheel].inject(time_ns, fault)
+            at = self.wheels.index(wheel)
+            self.motors[at].inject(time_ns, fault)
             if fault in LATCHING:
-                self._fail(time_ns, wheel, fault)
+                self._fail(time_ns, at, fault)
         return frames
 
     def mend(self, time_ns: int, wheel: int, fault: Fault) -> None:
         """Takes the cause of a fault away.  A drive that was silent starts as after power-on."""
         self._pending = self._at_wheel(time_ns, wheel, fault)
         if fault is not Fault.SILENT:
-            self.motors[wheel].mend(time_ns, fault)
+            self.motors[self.wheels.index(wheel)].mend(time_ns, fault)
         elif wheel in self._silent:
             self._silent.discard(wheel)
             if not self._silent:
@@ -149,8 +154,8 @@ class CyclicDrive(ABC):
         return self._heard_ns + self.plan.watchdog_ns if enabled else NEVER_NS
 
     def _at_wheel(self, time_ns: int, wheel: int, fault: Fault) -> list[Frame]:
-        if wheel not in (0, 1):
-            raise ValueError(f"wheel must be 0 (right) or 1 (left), not {wheel!r}")
+        if wheel not in self.wheels:
+            raise ValueError(f"wheel must be one of {self.wheels} (0 right, 1 left), not {wheel!r}")
         if fault not in ON_DEMAND:
             raise ValueError(f"no fault on demand: {fault!r}; there are {', '.join(ON_DEMAND)}")
         return self.advance(time_ns)

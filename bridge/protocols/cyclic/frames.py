@@ -20,9 +20,9 @@ class WheelState(IntEnum):
 class Command(NamedTuple):
     """The content of a command."""
 
-    torques: tuple[float, float]
-    """Wanted wheel torques [N m]; 0 for a wheel that is not enabled"""
-    enable: tuple[bool, bool]
+    torques: tuple[float, ...]
+    """Wanted wheel torques [N m]; 0 for a wheel that is not enabled.  For a drive of one wheel there is one value"""
+    enable: tuple[bool, ...]
     clear: bool
     """Clear faults whose cause is gone; a wheel in a fault is not enabled by the same command"""
     estop: bool

@@ -163,7 +163,7 @@ class NativeCodec:
         tau_left: float,
         counter: int,
         *,
-        enable: tuple[bool, bool] = (True, True),
+        enable: tuple[bool, ...] = (True, True),
         saturated: bool = False,
         clear: bool = False,
         estop: bool = False,

@@ -59,11 +59,11 @@ class NativeDrive(CyclicDrive):
         torques, enable = (said.tau_right, said.tau_left), (said.enable_right, said.enable_left)
         return Command(torques, enable, said.clear, said.estop)
 
-    def report(self, torques: tuple[float, float]) -> list[Frame]:
+    def report(self, torques: tuple[float, ...]) -> list[Frame]:
         """Returns the feedback of an instant, every tenth time with the status."""
         right, left = self.motors
         states, faults = (self.states[0], self.states[1]), (CODES[self.faults[0]], CODES[self.faults[1]])
-        feedback = Feedback(self._robot, torques, states, faults, self._sent)
+        feedback = Feedback(self._robot, (torques[0], torques[1]), states, faults, self._sent)
         frames = [Frame(self._feedback_id, self._codec.encode_feedback(feedback))]
         if self._sent % STATUS_EVERY == 0:
             status = Status(

@@ -52,11 +52,13 @@ def failing(method: str, line: str, owner: str = "MyHost(CyclicHost)") -> tuple[
 
 
 @pytest.mark.slow
-def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Path) -> None:
-    scenario = folder / "my_drive.toml"
+@pytest.mark.parametrize("protocol", ["my_drive.py:MyProtocol", "my_wheels.py:MyProtocol"])
+def test_the_examples_run_in_one_process_and_in_many(protocol: str, folder: Path, tmp_path: Path) -> None:
+    scenario, use = folder / "my_drive.toml", f"robot.drive.protocol={protocol}"
+    shutil.copy(EXAMPLES / "my_wheels.py", folder)
     runs = {}
     for engine in ("inprocess", "processes"):
-        done = echelon("run", scenario, "--engine", engine, *QUIET, "--out", tmp_path / engine)
+        done = echelon("run", scenario, "--set", use, "--engine", engine, *QUIET, "--out", tmp_path / engine)
         assert done.returncode == 0, done.stdout + done.stderr
         runs[engine] = summary_of(tmp_path / engine)
         (folder / "my_drive.py").write_text(TEXT)
@@ -66,7 +68,7 @@ def test_the_example_runs_in_one_process_and_in_many(folder: Path, tmp_path: Pat
     assert one["verdict"]["word"] != "FAILS"
     assert one["can"]["referee"]["findings"] == []
     for row in many["can"]["robots"].values():
-        assert (row["protocol"], row["enabled"], row["fault"]) == ("my_drive.py:MyProtocol", True, "")
+        assert (row["protocol"], row["enabled"], row["fault"]) == (protocol, True, "")
         assert 0.01 < row["largest"] < 1.5
     # the run's folder contains the protocol, so the user's folder is not needed to look at the run
     shown = echelon("can", tmp_path / "inprocess", cwd=tmp_path)
@@ -274,6 +276,12 @@ HOST = "    def host(self, drive: DrivePlan) -> MyHost:\n        return MyHost(d
         ('("tau_left", 16)', '("tau_left", 8)', "messages raised Error: The signals tau_left and tau_right are overlapping"),
         ('Struct("<hhB")', 'Struct(">hhB")', "r1: torque_r1: its DBC reads tau_right = -4.865 where encode was given -0.02"),
         ('drive.torque_scale, "Nm"', '2 * drive.torque_scale, "Nm"', "its DBC reads tau_right = -0.04 where encode"),
+        ('size, signals(BRIDGE, "states")', 'size, [number("tau_left", 0, 16, "x", drive.torque_scale, "Nm")]',
+         "r1: feedback_r1: its DBC reads tau_left = -0.02 where report was given 0.03"),
+        ("    return Feedback((right * scale, left * scale)", "    return Feedback((left * scale, right * scale)",
+         "its host's decode reads 0.03 for the right wheel where report was given -0.02"),
+        ("    right, left, states = BODY.unpack(data)", "    return 'never'",
+         "its host's decode refuses a frame of report, ecff1e0000: never"),
         ('"tau_left", 16)', '"tau_left", 40)', "torque_r1: its DBC describes 8 bytes where encode returned 5"),
         ("return MyObserver(drive,", "return 7, (drive,", "what observer returns lacks cyclic, identifiers, observe, wheels"),
     ],

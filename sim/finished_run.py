@@ -179,8 +179,10 @@ class Run:
 
     def to_pandas(self) -> DataFrames:
         """Returns the run's tables as data frames.  Raises ImportError without pandas, which this package does not install."""
-        import pandas  # noqa: F401  raises ImportError here rather than at the first table
-
+        try:
+            import pandas  # noqa: F401  here, rather than at the first table
+        except ImportError:
+            raise ImportError("data frames need pandas, which echelon does not install: pip install pandas") from None
         return DataFrames(self.tables)
 
     def __getattr__(self, name: str) -> Any:

@@ -1,8 +1,10 @@
 """Functions for notebooks and scripts: `load`, `run` and `open_run`, with the same names of options as the command line."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import tomlkit
 
@@ -22,6 +24,23 @@ if TYPE_CHECKING:
     from echelon.sim.replay.replay import Replay
 
 
+_OPTION: Final = re.compile(r"(?<![\w-])--(set (?=\S)|[a-z]+(?:-[a-z]+)*)")
+_AS_ARGUMENT: Final = {"set ": "", "replace": "replace=True", "keep-going": "keep_going=True"}
+
+
+@contextmanager
+def _arguments_for_options() -> Iterator[None]:
+    """A context in which the text of a UserError names the arguments of Python's functions, not the command's options: `out`
+    instead of `--out`, and a change alone instead of `--set` with a change."""
+    try:
+        yield
+    except UserError as error:
+        lines = (
+            _OPTION.sub(lambda one: _AS_ARGUMENT.get(one[1], one[1].replace("-", "_")), line) for line in error.lines
+        )
+        raise type(error)(*lines) from error.__cause__
+
+
 class Loaded(NamedTuple):
     """A scenario with all its defaults, and its plan."""
 
@@ -34,6 +53,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Loaded
 result of `load`"""
 
 
+@_arguments_for_options()
 def load(scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> Loaded:
     """Loads a scenario and changes some of its values: `load("lab", {"law.lead": 0.0, "links.0.delay": 0.05})`.
 
@@ -50,6 +70,7 @@ def load(scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> Loa
     return Loaded(*parts.load(scenario_path(str(scenario)), overrides))
 
 
+@_arguments_for_options()
 def run(
     scenario: AnyScenario,
     changes: Mapping[str, Any] | None = None,
@@ -97,6 +118,7 @@ def open_run(folder: str | Path) -> Run:
     return run_folder.open_run(Path(folder))
 
 
+@_arguments_for_options()
 def replay(
     run: str | Path | Run,
     changes: Mapping[str, Any] | None = None,

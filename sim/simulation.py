@@ -54,7 +54,8 @@ class Simulation:
         self.done = False
         """True when the scenario's duration is over"""
         self.commands: Array = np.full((len(self.plan.robots), 2), np.nan)
-        """Accelerations (x, y) on which the robots are about to act, (robots, 2) [m/s²]; NaN for a robot without a command.
+        """Accelerations (x, y) on which the robots are about to act, (robots, 2) [m/s²], in the order of `plan.robots`; NaN for
+        a robot without a command.
         Values may be overwritten.  They hold for robots whose period begins at this instant; when the next period of a robot
         begins, it gets its leader's command again"""
         self._moves = self._run()
@@ -67,7 +68,8 @@ class Simulation:
 
     @property
     def states(self) -> Records:
-        """The last state of each robot, one record each: its name `robot` and the fields of `echelon.messages.STATE_FIELDS`."""
+        """The last state of each robot, one record each, in the order of `plan.robots`: its name `robot`, and `x`, `y` [m], …
+        as in `Run.robots` (the fields of `echelon.messages.STATE_FIELDS`)."""
         table = np.zeros(len(self.plan.robots), dtype=_STATE)
         table["robot"] = [robot.name for robot in self.plan.robots]
         for index, values in self._last.items():

@@ -12,6 +12,7 @@ from typing import Any, Final
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
 from echelon.plan.plan import Plan
+from echelon.shipped import FOLDER
 from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
 
 SHORT_QUEUE: Final = 100
@@ -31,7 +32,9 @@ def check_vcan(name: str = "vcan0") -> Diagnosis:
         more = "sudo modprobe vcan; " if not Path("/sys/module/vcan").exists() else ""
         made = f"sudo ip link add {name} type vcan; sudo ip link set {name} up txqueuelen 1000"
         return Diagnosis(name, "note", "does not exist, but the kernel can make it", (more + made,))
-    guest = "deploy/vcan.sh COMMAND, which runs the command in a small virtual machine that has vcan0"
+    guest = (
+        f"bash {FOLDER.parent / 'vcan.sh'} COMMAND, which runs the command in a small virtual machine that has vcan0"
+    )
     if not shutil.which("linux.uml", path=_TOOLS):
         guest += " (apt-get install user-mode-linux busybox-static iproute2)"
     return Diagnosis(

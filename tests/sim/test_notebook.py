@@ -206,6 +206,21 @@ def test_a_class_is_not_a_value_of_a_scenario(use: object) -> None:
             echelon.load(scenario, changes)  # type: ignore[arg-type]
 
 
+def test_mistakes_in_python_name_pythons_arguments(tmp_path: Path) -> None:
+    (tmp_path / "scenario.toml").write_text("mine")
+    for says, call in (
+        (
+            f"out {tmp_path}: scenario.toml exists",
+            lambda: echelon.run("lab", out=tmp_path, quiet=True, engine="inprocess"),
+        ),
+        ("lab.toml with law.lead=-1.0: law.lead = -1.0", lambda: echelon.load("lab", {"law.lead": -1.0})),
+    ):
+        with pytest.raises(echelon.UserError) as caught:
+            call()
+        assert says in str(caught.value)
+        assert "--" not in str(caught.value)
+
+
 def test_errors_and_states_are_those_of_the_instant() -> None:
     simulation = echelon.Simulation("lab", {"duration": 0.2, "claims": []})
     simulation.run_until(0.1)

@@ -185,5 +185,5 @@ def test_a_script_may_run_into_the_same_folder_again(tmp_path: Path) -> None:
     for scenario, replace in (("lab", False), ("lab", False), ("paper", True)):
         done = api.run(scenario, changes, engine="inprocess", out=tmp_path / "run", quiet=True, replace=replace)
         assert done.scenario == scenario
-    with pytest.raises(UsageError, match="--replace"):
+    with pytest.raises(UsageError, match="or replace=True to delete that run"):
         api.run("lab", changes, engine="inprocess", out=tmp_path / "run", quiet=True)

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import textwrap
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Iterator, Mapping
@@ -95,8 +96,11 @@ def _parts() -> Iterator[str]:
 
 
 def _imports() -> Iterator[str]:
-    """Yields what the examples of parts import: authors of parts need these modules, too."""
+    """Yields what the examples of parts and the pages about parts import: authors of parts need these modules, too."""
     found: dict[str, set[str]] = {}
+    for page in sorted((ROOT / "docs").glob("add-*.md")):
+        for module, names in re.findall(r"from (echelon\.[\w.]+) import ([\w, ]+)", page.read_text(encoding="utf-8")):
+            found.setdefault(module, set()).update(name.strip() for name in names.split(","))
     for path in sorted((ROOT / "examples").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("echelon."):

@@ -277,6 +277,8 @@ class Plan:
     """The coupling K̄ of all blocks, (2N, 2N) for N robots; a block is not coupled to itself"""
     lead: float
     """λ, how far ahead the law looks, in acceleration periods of the node (docs/architecture.md, 2.5)"""
+    reference: str
+    """`message` or `now`: of which time the reference is that a state is compared with (docs/architecture.md, 2.5)"""
     trajectory: Part[Any]
     """The desired trajectory of the centroid, a controller.trajectory.Trajectory"""
     avoidance: AvoidancePlan

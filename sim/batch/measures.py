@@ -1,0 +1,122 @@
+"""What is measured of a run while it goes (sim.results, as arrays): errors of blocks, settling, distances.
+
+*Settling without the history.*  |e| has settled to the fraction f of the error that it starts with, S, from the instant on after
+the last at which |e| > f S.  S is the largest |e| of the first response time, so f S is not known before.  Let M be the largest
+|e| so far.  When |e| exceeds M, that instant itself is outside of f M, because f < 1, and it is later than all before.  So it is
+enough to keep the last instant at which |e| > f M.
+"""
+
+from math import isfinite, sqrt
+from typing import Any
+
+from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.law import desired, to_shape
+from echelon.sim.batch.records import (
+    BLOCK_WHOLES,
+    M_FINITE,
+    M_IAE,
+    M_ISE,
+    M_ITAE,
+    M_LAST,
+    M_OUT_FLOOR,
+    M_PEAK,
+    M_PEAK_NS,
+    M_START,
+    X,
+    Y,
+)
+
+
+@compiled
+def measure(
+    run: Any, robots: Any, nodes: Any, blocks: Any, table: Any, index: Any, real: Any, whole: Any, time_ns: int, step_ns: int
+) -> None:
+    """Notes the robots' positions at `time_ns`, `step_ns` after the last time (0 at the first)."""
+    places = run.places_at
+    for robot in range(len(robots)):
+        real[places + 2 * robot] = real[robots[robot].at + X]
+        real[places + 2 * robot + 1] = real[robots[robot].at + Y]
+    for number in range(len(nodes)):
+        node = nodes[number]
+        count, z = node.count, node.f_pot_at
+        for child in range(count):
+            place = places + 2 * index[node.children_at + child]
+            real[node.a_at + 2 * child] = real[place]
+            real[node.a_at + 2 * child + 1] = real[place + 1]
+        to_shape(count, 2, index, node.weights_at, real, node.a_at, z)
+        centroid = places + 2 * (len(robots) + number)
+        real[centroid] = real[z + 2 * (count - 1)]
+        real[centroid + 1] = real[z + 2 * (count - 1) + 1]
+        square = 0.0
+        for row in range(2 * (count - 1)):
+            square += (real[z + row] - table[node.desired_at + row]) ** 2
+        _note_error(run, blocks[node.block], table, real, whole, sqrt(square), time_ns, step_ns)
+        if node.link < 0:
+            x, y, _, _, _, _ = desired(run, table, time_ns / 1e9)
+            norm = sqrt((real[centroid] - x) ** 2 + (real[centroid + 1] - y) ** 2)
+            _note_error(run, blocks[-1], table, real, whole, norm, time_ns, step_ns)
+    if step_ns > 0:
+        _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+    for value in range(2 * len(robots)):
+        real[run.before_at + value] = real[places + value]
+    if step_ns == 0:
+        _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+
+
+@compiled
+def _note_error(
+    run: Any, block: Any, table: Any, real: Any, whole: Any, norm: float, time_ns: int, step_ns: int
+) -> None:
+    at, marks = block.measures_at, block.marks_at
+    if step_ns == 0 or norm > real[at + M_PEAK] or (norm != norm and whole[marks + M_FINITE]):
+        real[at + M_PEAK] = norm
+        whole[marks + M_PEAK_NS] = time_ns
+    if not isfinite(norm):
+        whole[marks + M_FINITE] = 0
+    if time_ns <= block.response_ns and not norm <= real[at + M_START]:
+        real[at + M_START] = norm
+    for number in range(run.fractions):
+        if norm > table[run.fractions_at + number] * real[at + M_START]:
+            whole[marks + BLOCK_WHOLES + number] = time_ns
+    if norm > run.floor:
+        whole[marks + M_OUT_FLOOR] = time_ns
+    before = real[at + M_LAST]
+    step = step_ns / 1e9
+    real[at + M_ISE] += step * (norm * norm + before * before) / 2
+    real[at + M_IAE] += step * (norm + before) / 2
+    real[at + M_ITAE] += step * (norm * (time_ns / 1e9) + before * ((time_ns - step_ns) / 1e9)) / 2
+    real[at + M_LAST] = norm
+
+
+@compiled
+def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
+    """Notes how close robots came since the last instant, on straight lines (sim.results.distances)."""
+    now, before = run.places_at, run.before_at
+    fastest = 0.0
+    for robot in range(robots):
+        dx, dy = real[now + 2 * robot] - real[before + 2 * robot], real[now + 2 * robot + 1] - real[before + 2 * robot + 1]
+        fastest = max(fastest, dx * dx + dy * dy)
+    least, radius = real[run.distance_at], run.avoidance_radius * run.avoidance_radius
+    reach = (sqrt(max(least, radius)) + 2 * sqrt(fastest)) ** 2
+    for one in range(robots):
+        x_0, y_0 = real[before + 2 * one], real[before + 2 * one + 1]
+        for other in range(one + 1, robots):
+            x, y = real[before + 2 * other] - x_0, real[before + 2 * other + 1] - y_0
+            square = x * x + y * y
+            if square > reach:
+                continue
+            dx = real[now + 2 * other] - real[now + 2 * one] - x
+            dy = real[now + 2 * other + 1] - real[now + 2 * one + 1] - y
+            change = dx * dx + dy * dy
+            along = 0.0
+            if change > 0.0:
+                along = min(max(-(x * dx + y * dy) / change, 0.0), 1.0)
+            between = (x + along * dx) ** 2 + (y + along * dy) ** 2
+            nearest = min(between, square)
+            if nearest < real[run.distance_at]:
+                real[run.distance_at] = nearest
+                whole[run.closest_at] = one
+                whole[run.closest_at + 1] = other
+                whole[run.closest_at + 2] = time_ns - step_ns + int(round(along * step_ns))
+            if nearest <= radius and (step_ns == 0 or square > radius):
+                whole[run.closest_at + 3] += 1

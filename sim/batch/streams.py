@@ -1,0 +1,157 @@
+"""Messages between roles: what a role says, what becomes of it on the way, and what its receiver uses
+(echelon.runtime.link and mailbox, as arrays)."""
+
+from math import floor
+from typing import Any
+
+import numpy as np
+
+from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.philox import philox, uniform
+from echelon.sim.batch.records import (
+    AGE_MAX,
+    AGE_SUM,
+    DELIVERED,
+    FAR,
+    GONE,
+    HELD,
+    IN_USE,
+    IS_NULL,
+    LAST,
+    LINK_WHOLES,
+    LOST,
+    NEXT,
+    OLDEST,
+    STAMP,
+    TAKEN,
+    USED,
+)
+
+
+@compiled
+def room(stream: Any, whole: Any) -> int:
+    """Returns where in `real` the values of the stream's next message belong."""
+    return stream.at + (whole[stream.marks_at] & stream.mask) * stream.size
+
+
+@compiled
+def say(stream: Any, whole: Any, time_ns: int, is_null: int) -> None:
+    """Sends the message whose values are at `room`, with the stamp `time_ns`."""
+    number = whole[stream.marks_at]
+    mark = stream.marks_at + 1 + 2 * (number & stream.mask)
+    whole[mark] = time_ns
+    whole[mark + 1] = is_null
+    whole[stream.marks_at] = number + 1
+
+
+@compiled
+def hear(at: int, links: Any, streams: Any, index: Any, keys: Any, real: Any, whole: Any, time_ns: int) -> int:
+    """Returns where in `real` the values of the message in use on link number `at` are at `time_ns`, or -1 if none is in use;
+    counts the use.  Must be called with ascending instants."""
+    link = links[at]
+    stream = streams[link.stream]
+    marks = link.marks_at
+    if link.ideal:
+        number = whole[stream.marks_at] - 1
+        whole[marks + TAKEN] = number + 1
+        mark = stream.marks_at + 1 + 2 * (number & stream.mask)
+        stamp, is_null = whole[mark], whole[mark + 1]
+        place = stream.at + (number & stream.mask) * stream.size
+    else:
+        _take(link, stream, keys[at], real, whole)
+        if whole[marks + NEXT] <= time_ns:
+            _receive(link, stream, index, real, whole, time_ns)
+        number, stamp, is_null = whole[marks + IN_USE], whole[marks + STAMP], whole[marks + IS_NULL]
+        place = link.at
+    age = time_ns - stamp
+    if number < 0 or is_null or age > link.timeout_ns:
+        return -1
+    whole[marks + USED] += 1
+    if age != 0:
+        if number == whole[marks + LAST]:
+            whole[marks + HELD] += 1
+        whole[marks + AGE_SUM] += age
+        if age > whole[marks + AGE_MAX]:
+            whole[marks + AGE_MAX] = age
+    whole[marks + LAST] = number
+    return int(place)
+
+
+@compiled
+def _take(link: Any, stream: Any, key: Any, real: Any, whole: Any) -> None:
+    """Draws what becomes of the messages that were sent since the last call."""
+    marks = link.marks_at
+    number = whole[marks + TAKEN]
+    while number < whole[stream.marks_at]:
+        sent_ns = whole[stream.marks_at + 1 + 2 * (number & stream.mask)]
+        delay_ns = fate(link, number, key, real)
+        arrival = marks + LINK_WHOLES + (number & link.mask)
+        if delay_ns < 0:
+            whole[marks + LOST] += 1
+            whole[arrival] = GONE
+        else:
+            whole[arrival] = sent_ns + delay_ns
+            whole[marks + NEXT] = min(whole[marks + NEXT], sent_ns + delay_ns)
+        number += 1
+    whole[marks + TAKEN] = number
+
+
+@compiled
+def fate(link: Any, number: int, key: Any, real: Any) -> int:
+    """Returns the delay of a message [ns], or -1 if it is lost.  Must be called with ascending numbers from 0 on."""
+    draws = link.draws_at
+    if number % 2 == 0:  # each count of the generator has two words for each of two messages; numpy's counts begin with 1
+        a, b, c, d = philox(key[0], key[1], np.uint64(number // 2 + 1))
+        real[draws] = uniform(a)
+        real[draws + 1] = uniform(b)
+        real[draws + 2] = uniform(c)
+        real[draws + 3] = uniform(d)
+    else:
+        draws += 2
+    if real[draws] < link.loss:
+        return -1
+    return int(link.delay_min_ns) + _rounded(real[draws + 1] * link.delay_span_ns)
+
+
+@compiled
+def _rounded(value: float) -> int:
+    """Returns the nearest integer of a value that is not negative; the even one of two."""
+    below = int(floor(value))
+    rest = value - below
+    return below + int(rest > 0.5 or (rest == 0.5 and below % 2 == 1))
+
+
+@compiled
+def _receive(link: Any, stream: Any, index: Any, real: Any, whole: Any, time_ns: int) -> None:
+    """Counts the messages that have arrived by `time_ns`, and takes the newest of them into use if it is newer than the one in
+    use."""
+    marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
+    newest, next_ns = -1, FAR
+    taken = whole[marks + TAKEN]
+    oldest = max(whole[marks + OLDEST], taken - link.mask - 1)  # what is older has arrived or is lost
+    for number in range(oldest, taken):
+        arrival = arrivals + (number & link.mask)
+        if whole[arrival] == GONE:
+            continue
+        if whole[arrival] <= time_ns:
+            whole[arrival] = GONE
+            whole[marks + DELIVERED] += 1
+            newest = number
+        else:
+            next_ns = min(next_ns, whole[arrival])
+    while oldest < taken and whole[arrivals + (oldest & link.mask)] == GONE:
+        oldest += 1
+    whole[marks + OLDEST] = oldest
+    whole[marks + NEXT] = next_ns
+    if newest <= whole[marks + IN_USE]:
+        return
+    mark = stream.marks_at + 1 + 2 * (newest & stream.mask)
+    whole[marks + IN_USE] = newest
+    whole[marks + STAMP] = whole[mark]
+    whole[marks + IS_NULL] = whole[mark + 1]
+    if whole[mark + 1] == 0:
+        source = stream.at + (newest & stream.mask) * stream.size
+        for part in range(link.parts):
+            first = index[link.parts_at + 2 * part]
+            for value in range(first, first + index[link.parts_at + 2 * part + 1]):
+                real[link.at + value] = real[source + value]

@@ -1,72 +1,84 @@
-"""Many runs of one plan: `run_many`."""
+"""Many runs of one plan at once: `run_many`."""
 
 import os
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echelon.errors import UsageError
 from echelon.plan.plan import Plan
-from echelon.runtime.link import LinkCounts, link_key
-from echelon.sim.batch import records as r
+from echelon.runtime.link import link_key
 from echelon.sim.batch.model import ModelMaker, refusal
+from echelon.sim.batch.outcomes import TRACED, BatchRuns, Kept, outcomes
 
-Say = Callable[[str], None]
-TRACED: Final = ("x", "y", "theta", "v", "omega", "cos_theta", "sin_theta")
-"""What a trace has of each robot"""
-_CHUNK: Final = 16
+MOST_AT_ONCE = 16
 """Largest number of runs that a thread takes at once"""
 
 
-@dataclass(frozen=True, slots=True)
-class BatchRuns:
-    """What was measured of the runs of one plan, one row for each of `seeds`."""
-
-    plan: Plan
-    seeds: tuple[int, ...]
-    fractions: tuple[float, ...]
-    lost_ns: NDArray[np.int64]
-    reals: NDArray[np.float64]
-    wholes: NDArray[np.int64]
-    traces: NDArray[np.float64]
-
-
 def run_many(
-    plan: Plan, seeds: Sequence[int], *, threads: int | None = None, traces: bool = False, say: Say | None = None
-) -> Any:
-    """Runs a plan once for each seed, on all cores."""
+    plan: Plan,
+    seeds: Sequence[int],
+    *,
+    threads: int | None = None,
+    traces: bool = False,
+    say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
+    progress: Callable[[int], None] = lambda done: None,
+) -> BatchRuns:
+    """Runs a plan once for each seed, and returns what was measured.
+
+    Each run is the one that the in-process engine makes of the plan with that seed, to rounding.  It ends at the first instant
+    at which a robot's state is not finite.  Runs do not depend on `threads` (by default one for each core).  `traces` asks for
+    the robots' states too.  `say` gets a line when code must be compiled first, `progress` the number of runs done so far.
+
+    Raises UsageError if there are no seeds, or if this engine cannot run the plan."""
+    if not seeds or (threads is not None and threads < 1):
+        raise UsageError(f"{len(seeds)} seeds, {threads} threads: there must be at least one of each")
     if why := refusal(plan):
         raise UsageError(why)
     maker = ModelMaker(plan)
-    model = maker.make()
-    from echelon.sim.batch.compiled import is_kept
-    from echelon.sim.batch.whole_run import many_runs
+    model, pools = maker.make(), maker.pools
+    from echelon.sim.batch import whole_run  # the compiler, when it is needed
 
-    names = [one.name for one in plan.all_roles]
-    keys = np.empty((len(seeds), max(1, len(plan.links)), 2), dtype=np.uint64)
-    for row, seed in enumerate(seeds):
-        for at, link in enumerate(plan.links):
-            key = 0 if link.ideal else link_key(seed, names[link.source], names[link.receiver], link.channel)
-            keys[row, at] = key & (2**64 - 1), key >> 64
-    common_ns = int(model.run["common_ns"][0])
-    shape = (len(seeds), plan.duration_ns // common_ns + 1) if traces else (1, 0)
-    traced = np.full((*shape, len(plan.robots), len(TRACED)), np.nan)
-    kept_reals = np.arange(maker.pools.reals)
-    kept_wholes = np.arange(maker.pools.wholes)
-    reals = np.empty((len(seeds), len(kept_reals)))
-    wholes = np.empty((len(seeds), len(kept_wholes)), dtype=np.int64)
+    if not whole_run.is_kept():
+        say("compiling the batch engine: once on this machine, for about half a minute")
+    keys, kept = _keys(plan, seeds), Kept.of(model)
+    instants = plan.duration_ns // int(model.run["common_ns"][0]) + 1
+    traced = np.full((len(seeds) if traces else 1, instants if traces else 0, len(plan.robots), len(TRACED)), np.nan)
+    reals = np.empty((len(seeds), len(kept.reals)))
+    wholes = np.empty((len(seeds), len(kept.wholes)), dtype=np.int64)
     lost_ns = np.empty(len(seeds), dtype=np.int64)
+
+    def work(part: range) -> int:
+        scratch = np.empty(pools.reals), np.empty(pools.wholes, dtype=np.int64)
+        whole_run.many_runs(
+            model, keys, part.start, part.stop, *scratch, traced, lost_ns, kept.reals, kept.wholes, reals, wholes
+        )
+        return len(part)
+
+    work(range(0))
     count = threads or len(os.sched_getaffinity(0))
+    size = max(1, min(MOST_AT_ONCE, len(seeds) // (4 * count)))
+    parts = [range(first, min(first + size, len(seeds))) for first in range(0, len(seeds), size)]
+    pool, done = ThreadPoolExecutor(count), 0
+    try:
+        for finished in pool.map(work, parts):
+            done += finished
+            progress(done)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return outcomes(plan, model, seeds, lost_ns, reals, wholes, traced if traces else None)
 
-    def work(first: int, last: int) -> None:
-        real, whole = np.empty(maker.pools.reals), np.empty(maker.pools.wholes, dtype=np.int64)
-        many_runs(model, keys, first, last, real, whole, reals, wholes, traced, lost_ns, kept_reals, kept_wholes)
 
-    work(0, 0)
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(lambda first: work(first, min(first + _CHUNK, len(seeds))), range(0, len(seeds), _CHUNK)))
-    return model, maker, BatchRuns(plan, tuple(seeds), maker.fractions, lost_ns, reals, wholes, traced)
+def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.uint64]:
+    """Returns the Philox key of each link for each seed, (seeds, links, 2); zero for ideal links, which draw nothing."""
+    names = [one.name for one in plan.all_roles]
+    keys = np.zeros((len(seeds), max(1, len(plan.links)), 2), dtype=np.uint64)
+    lossy = [(at, link) for at, link in enumerate(plan.links) if not link.ideal]
+    for row, seed in enumerate(seeds):
+        for at, link in lossy:
+            key = link_key(seed, names[link.source], names[link.receiver], link.channel)
+            keys[row, at] = key & (2**64 - 1), key >> 64
+    return keys

@@ -1,8 +1,8 @@
 """The one place that knows the compiler.  Everything else in this room that is marked `compiled` is plain Python on numbers and
 arrays: it runs uncompiled too, only slowly (with NUMBA_DISABLE_JIT=1 in the environment).
 
-What is marked may call what is marked.  It allocates nothing: its scratch is an argument.  It uses floats and integers only.  So
-the same source can be compiled for other targets.
+What is marked may call what is marked.  It allocates nothing: its scratch is an argument.  It uses floats and integers
+only.  So the same source can be compiled for other targets.
 
 Compiled code is kept in a folder for the sources it was made of, because numba looks only at the file of a function itself and
 not at the files of what that function calls.
@@ -14,27 +14,40 @@ import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 
+_compiler: Any = numba  # without types: what there is of them changes from version to version
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function when it is first called."""
-    numba.config.CACHE_DIR, before = str(cache_folder()), numba.config.CACHE_DIR
+    """Compiles a function when it is first called; its arithmetic is that of Python to the last bit."""
+    return _compiled(function, fused=False)
+
+
+def fused(function: Callable[P, R]) -> Callable[P, R]:
+    """The same, but a product may go into a sum without being rounded before."""
+    return _compiled(function, fused=True)
+
+
+def _compiled(function: Callable[P, R], fused: bool) -> Callable[P, R]:
+    _compiler.config.CACHE_DIR, before = str(cache_folder()), _compiler.config.CACHE_DIR
     try:
-        marked: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        # Nothing is allocated, so nothing needs counts of references (_nrt).
+        marked: Callable[P, R] = _compiler.njit(
+            cache=True, nogil=True, error_model="numpy", fastmath={"contract"} if fused else False, _nrt=False
+        )(function)
         return marked
     finally:
-        numba.config.CACHE_DIR = before
+        _compiler.config.CACHE_DIR = before
 
 
 def is_kept() -> bool:
     """True if the compiled code of these sources is kept, so that loading it takes less than a second."""
-    return any(cache_folder().rglob("*.nbc"))
+    return any(cache_folder().rglob("whole_run.many_runs*.nbc"))
 
 
 @cache

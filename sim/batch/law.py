@@ -1,114 +1,130 @@
 """The law of a node's own blocks, the transformation, and the trajectory (controller.laws, transformation and trajectory, as
 arrays).
 
-Values of n children, or of n variables, are rows of `width` numbers each.
+Values of the children of a node, or of its variables, are rows of `width` numbers each.
 """
 
-from math import cos, sin, sqrt
+from math import sqrt
 from typing import Any, Final
 
 from echelon.controller.laws.terminal_sliding import PRECISION, STEPS
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.angles import cos_sin
+from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.records import CIRCLE, INTEGRAL, LINE, SINE, SLIDING
 
 _ROOT_2: Final = sqrt(2.0)
+_PER_ROOT_2: Final = 1 / _ROOT_2
 
 
-@compiled
-def to_shape(count: int, width: int, weights: Any, weights_at: int, real: Any, x: int, z: int) -> None:
-    """Writes Φ_node x to z: the shape variables, then the centroid.  x and z must not overlap."""
-    last = z + (count - 1) * width
-    for part in range(width):
-        mean = real[x + part]
-        total = weights[weights_at]
-        for child in range(1, count):
-            value = real[x + child * width + part]
-            if child == 1:
-                real[z + part] = (mean - value) / _ROOT_2
-            else:
-                real[z + (child - 1) * width + part] = value - mean
-            weight = weights[weights_at + child]
-            total += weight
-            mean += (value - mean) * (weight / total)
-        real[last + part] = mean
-
-
-@compiled
-def to_children(count: int, weights: Any, weights_at: int, total: int, real: Any, z: int, x: int) -> None:
-    """Writes Φ_node⁻¹ z to x; rows of two numbers.  `total` is the sum of the weights."""
-    for part in range(2):
-        mean = real[z + (count - 1) * 2 + part]
-        all_weights = total
-        for child in range(count - 1, 1, -1):
-            value = real[z + (child - 1) * 2 + part]
-            mean -= value * (weights[weights_at + child] / all_weights)
-            real[x + child * 2 + part] = mean + value
-            all_weights -= weights[weights_at + child]
-        if count == 1:
-            real[x + part] = mean
+@fused
+def to_shape(node: Any, width: int, table: Any, real: Any, x: int, z: int) -> None:
+    """Writes Φ_node x to z for the first two numbers of each row: the shape variables, then the centroid.  x and z must not
+    overlap."""
+    mean_x, mean_y = real[x], real[x + 1]
+    for child in range(1, node.count):
+        x += width
+        apart_x, apart_y = real[x] - mean_x, real[x + 1] - mean_y
+        if child == 1:
+            real[z], real[z + 1] = -apart_x * _PER_ROOT_2, -apart_y * _PER_ROOT_2
         else:
-            apart = _ROOT_2 * real[z + part]
-            real[x + part] = mean + apart * (weights[weights_at + 1] / all_weights)
-            real[x + 2 + part] = mean - apart * (weights[weights_at] / all_weights)
+            real[z], real[z + 1] = apart_x, apart_y
+        share = table[node.shares_at + child]
+        mean_x += apart_x * share
+        mean_y += apart_y * share
+        z += width
+    real[z], real[z + 1] = mean_x, mean_y
 
 
-@compiled
-def product(matrix: Any, at: int, diagonal: int, size: int, row: int, vector: Any, first: int, stride: int) -> float:
-    """Returns one row of a matrix of gains times the x and y, `stride` numbers apart from variable to variable, from `first` on
-    in `vector`."""
-    if diagonal:
-        return float(matrix[at + row] * vector[first + (row // 2) * stride + row % 2])
-    total = 0.0
-    for column in range(size):
-        total += matrix[at + row * size + column] * vector[first + (column // 2) * stride + column % 2]
-    return total
+@fused
+def to_children(node: Any, table: Any, real: Any, z: int, x: int) -> None:
+    """Writes Φ_node⁻¹ z to x, two numbers for each child."""
+    last = 2 * (node.count - 1)
+    mean_x, mean_y = real[z + last], real[z + last + 1]
+    for child in range(node.count - 1, 1, -1):
+        apart_x, apart_y = real[z + 2 * child - 2], real[z + 2 * child - 1]
+        share = table[node.shares_at + child]
+        mean_x -= apart_x * share
+        mean_y -= apart_y * share
+        real[x + 2 * child], real[x + 2 * child + 1] = mean_x + apart_x, mean_y + apart_y
+    if node.count > 1:
+        apart_x, apart_y = real[z] * _ROOT_2, real[z + 1] * _ROOT_2
+        share = table[node.shares_at + 1]
+        mean_x += apart_x * share
+        mean_y += apart_y * share
+        real[x + 2], real[x + 3] = mean_x - apart_x, mean_y - apart_y
+    real[x], real[x + 1] = mean_x, mean_y
 
 
-@compiled
+@fused
 def own_law(run: Any, block: Any, table: Any, index: Any, real: Any, e: int, rates: int, force: int, eta: int) -> None:
     """Writes η = ν - Z̈_bd + W (-Σ K̄_bb' ė_b' + F_pot,b/σ_b) of one block to `eta`, and integrates once.
 
-    `e`: place of the errors and their rates, rows (e_x, e_y, ė_x, ė_y).  `rates`: those of all blocks, or -1.  `force`: F_pot of
-    the block, or -1."""
+    `e`: place of the errors and their rates, rows (e_x, e_y, ė_x, ė_y).  `rates`: those of all blocks, or -1.  `force`: F_pot
+    of the block, or -1."""
     size = block.size
-    for row in range(size):
-        value = 0.0
-        if run.law == SLIDING:
-            at = e + 4 * (row // 2) + row % 2
-            value = _led(run, real[at], block.sigma * real[at + 2], block.ahead / block.sigma)
-            value /= block.sigma * block.sigma
-        else:
-            value -= product(table, block.k1_at, block.diagonal, size, row, real, e, 4)
-            value -= product(table, block.k2_at, block.diagonal, size, row, real, e + 2, 4)
-            if run.law == INTEGRAL:
-                value -= product(table, block.ki_at, block.diagonal, size, row, real, block.integral_at, 2)
-        if rates >= 0:
-            for entry in range(index[block.rows_at + row], index[block.rows_at + row + 1]):
-                value -= table[block.values_at + entry] * real[rates + index[block.rows_at + size + 1 + entry]]
-        if force >= 0:
-            value += product(table, block.pot_at, block.diagonal, size, row, real, force, 2)
-        real[eta + row] = value
-    if run.law == INTEGRAL:
-        T, bound = block.period, block.bound
+    if run.law == SLIDING:
         for row in range(size):
-            at = e + 4 * (row // 2) + row % 2
-            q = real[block.integral_at + row] + T * real[at] + T * T / 2 * real[at + 2]
-            real[block.integral_at + row] = min(max(q, -bound), bound)
+            at = e + 2 * row - row % 2
+            value = _led(run, real[at], block.sigma * real[at + 2], block.ahead / block.sigma)
+            real[eta + row] = value / (block.sigma * block.sigma)
+    elif block.diagonal:
+        for row in range(size):
+            at = e + 2 * row - row % 2
+            real[eta + row] = -table[block.k1_at + row] * real[at] - table[block.k2_at + row] * real[at + 2]
+    else:
+        for row in range(size):
+            k1, k2 = block.k1_at + row * size, block.k2_at + row * size
+            value = 0.0
+            for column in range(size):
+                at = e + 2 * column - column % 2
+                value -= table[k1 + column] * real[at] + table[k2 + column] * real[at + 2]
+            real[eta + row] = value
+    if run.law == INTEGRAL:
+        _integrate(block, table, real, e, eta)
+    if force >= 0:
+        for row in range(size):
+            if block.diagonal:
+                real[eta + row] += table[block.pot_at + row] * real[force + row]
+            else:
+                for column in range(size):
+                    real[eta + row] += table[block.pot_at + row * size + column] * real[force + column]
+    if rates >= 0:
+        columns = block.rows_at + size + 1
+        for row in range(size):
+            for entry in range(index[block.rows_at + row], index[block.rows_at + row + 1]):
+                real[eta + row] -= table[block.values_at + entry] * real[rates + index[columns + entry]]
 
 
-@compiled
+@fused
+def _integrate(block: Any, table: Any, real: Any, e: int, eta: int) -> None:
+    """Adds -K_i q to η, then integrates q."""
+    size, q, T = block.size, block.integral_at, block.period
+    for row in range(size):
+        if block.diagonal:
+            real[eta + row] -= table[block.ki_at + row] * real[q + row]
+        else:
+            for column in range(size):
+                real[eta + row] -= table[block.ki_at + row * size + column] * real[q + column]
+    for row in range(size):
+        at = e + 2 * row - row % 2
+        value = real[q + row] + T * real[at] + T * T / 2 * real[at + 2]
+        real[q + row] = min(max(value, -block.bound), block.bound)
+
+
+@fused
 def _sig(x: float, power: float) -> float:
-    return float(abs(x) ** power) if x >= 0.0 else -float(abs(x) ** power)
+    size: float = abs(x) ** power
+    return size if x >= 0.0 else -size
 
 
-@compiled
+@fused
 def _pull(run: Any, e: float, rate: float) -> float:
     """Returns f of terminal sliding (controller.laws.terminal_sliding)."""
     s = e + _sig(rate, run.gamma) / run.beta
-    return -run.beta / run.gamma * _sig(rate, 2 - run.gamma) - run.kappa * _sig(s, 2 / run.gamma - 1)
+    return float(-run.beta / run.gamma * _sig(rate, 2 - run.gamma) - run.kappa * _sig(s, 2 / run.gamma - 1))
 
 
-@compiled
+@fused
 def _led(run: Any, e: float, rate: float, h: float) -> float:
     """Returns f with look-ahead (controller.laws.terminal_sliding)."""
     e += h * rate
@@ -131,7 +147,7 @@ def _led(run: Any, e: float, rate: float, h: float) -> float:
     return far
 
 
-@compiled
+@fused
 def desired(run: Any, table: Any, t: float) -> tuple[float, float, float, float, float, float]:
     """Returns z_cd, ż_cd and z̈_cd at t [s], x and y of each."""
     at = run.trajectory_at
@@ -140,11 +156,13 @@ def desired(run: Any, table: Any, t: float) -> tuple[float, float, float, float,
         return table[at] + vx * t, table[at + 1] + vy * t, vx, vy, 0.0, 0.0
     if run.trajectory == CIRCLE:
         radius, rate, phase = table[at + 2], table[at + 3], table[at + 4]
-        c, s = radius * cos(rate * t + phase), radius * sin(rate * t + phase)
+        c, s = cos_sin(rate * t + phase)
+        c, s = radius * c, radius * s
         return table[at] + c, table[at + 1] + s, -rate * s, rate * c, -(rate * rate) * c, -(rate * rate) * s
     if run.trajectory == SINE:
         speed, amplitude, rate = table[at + 2], table[at + 3], table[at + 4]
-        s, c = amplitude * sin(rate * t), amplitude * cos(rate * t)
+        c, s = cos_sin(rate * t)
+        c, s = amplitude * c, amplitude * s
         return table[at] + speed * t, table[at + 1] + s, speed, rate * c, 0.0, -(rate * rate) * s
     leg = 0
     while leg < run.trajectory_legs - 1 and t >= table[at + 3 * (leg + 1)]:

@@ -1,15 +1,15 @@
 """What is measured of a run while it goes (sim.results, as arrays): errors of blocks, settling, distances.
 
-*Settling without the history.*  |e| has settled to the fraction f of the error that it starts with, S, from the instant on after
-the last at which |e| > f S.  S is the largest |e| of the first response time, so f S is not known before.  Let M be the largest
-|e| so far.  When |e| exceeds M, that instant itself is outside of f M, because f < 1, and it is later than all before.  So it is
-enough to keep the last instant at which |e| > f M.
+*Settling without the history.*  |e| has settled to the fraction f of the error S that it starts with from the instant after
+the last at which |e| > f S.  S is the largest |e| of the first response time, so f S is not known before that is over.  Let M
+be the largest |e| so far.  At an instant at which |e| exceeds M, it also exceeds f times the new M, because f < 1; and this
+instant is later than all before.  So it is enough to keep the last instant at which |e| > f M.
 """
 
 from math import isfinite, sqrt
 from typing import Any
 
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, to_shape
 from echelon.sim.batch.records import (
     BLOCK_WHOLES,
@@ -27,9 +27,18 @@ from echelon.sim.batch.records import (
 )
 
 
-@compiled
+@fused
 def measure(
-    run: Any, robots: Any, nodes: Any, blocks: Any, table: Any, index: Any, real: Any, whole: Any, time_ns: int, step_ns: int
+    run: Any,
+    robots: Any,
+    nodes: Any,
+    blocks: Any,
+    table: Any,
+    index: Any,
+    real: Any,
+    whole: Any,
+    time_ns: int,
+    step_ns: int,
 ) -> None:
     """Notes the robots' positions at `time_ns`, `step_ns` after the last time (0 at the first)."""
     places = run.places_at
@@ -43,7 +52,7 @@ def measure(
             place = places + 2 * index[node.children_at + child]
             real[node.a_at + 2 * child] = real[place]
             real[node.a_at + 2 * child + 1] = real[place + 1]
-        to_shape(count, 2, index, node.weights_at, real, node.a_at, z)
+        to_shape(node, 2, table, real, node.a_at, z)
         centroid = places + 2 * (len(robots) + number)
         real[centroid] = real[z + 2 * (count - 1)]
         real[centroid + 1] = real[z + 2 * (count - 1) + 1]
@@ -63,7 +72,7 @@ def measure(
         _note_distances(run, len(robots), real, whole, time_ns, step_ns)
 
 
-@compiled
+@fused
 def _note_error(
     run: Any, block: Any, table: Any, real: Any, whole: Any, norm: float, time_ns: int, step_ns: int
 ) -> None:
@@ -88,13 +97,16 @@ def _note_error(
     real[at + M_LAST] = norm
 
 
-@compiled
+@fused
 def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
     """Notes how close robots came since the last instant, on straight lines (sim.results.distances)."""
     now, before = run.places_at, run.before_at
     fastest = 0.0
     for robot in range(robots):
-        dx, dy = real[now + 2 * robot] - real[before + 2 * robot], real[now + 2 * robot + 1] - real[before + 2 * robot + 1]
+        dx, dy = (
+            real[now + 2 * robot] - real[before + 2 * robot],
+            real[now + 2 * robot + 1] - real[before + 2 * robot + 1],
+        )
         fastest = max(fastest, dx * dx + dy * dy)
     least, radius = real[run.distance_at], run.avoidance_radius * run.avoidance_radius
     reach = (sqrt(max(least, radius)) + 2 * sqrt(fastest)) ** 2
@@ -117,6 +129,6 @@ def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, 
                 real[run.distance_at] = nearest
                 whole[run.closest_at] = one
                 whole[run.closest_at + 1] = other
-                whole[run.closest_at + 2] = time_ns - step_ns + int(round(along * step_ns))
+                whole[run.closest_at + 2] = time_ns - step_ns + round(along * step_ns)
             if nearest <= radius and (step_ns == 0 or square > radius):
                 whole[run.closest_at + 3] += 1

@@ -1,13 +1,12 @@
 """From a plan to arrays (`records`): once for each plan, before its runs."""
 
-from collections.abc import Sequence
 from itertools import accumulate
-from math import gcd, hypot, lcm, sqrt
+from math import gcd, lcm
 from typing import Any, Final
 
 import numpy as np
 
-from echelon.agents.plant import GRAVITY, Hill, Paper, RigidBody
+from echelon.agents.plant import Hill, Paper, RigidBody
 from echelon.controller.laws import Integral, Linear, TerminalSliding
 from echelon.controller.laws.law import Block, law_block
 from echelon.controller.trajectory import Circle, Line, Sine, Waypoints
@@ -16,10 +15,11 @@ from echelon.messages import Channel
 from echelon.plan.layout import NodeLayout, acceleration_of, length
 from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan
 from echelon.sim.batch import records as r
+from echelon.sim.batch.outcomes import fractions
+from echelon.sim.batch.pools import Pools, records_of
+from echelon.sim.batch.robots import motion_of
 from echelon.sim.results.settling import response_ns
 
-FRACTIONS: Final = (0.02, 0.05)
-"""Of settling, as in a summary"""
 KINDS: Final = {
     "law": (Linear, Integral, TerminalSliding),
     "trajectory": (Line, Circle, Sine, Waypoints),
@@ -34,41 +34,8 @@ def refusal(plan: Plan) -> str | None:
     parts = [("law", plan.law), ("trajectory", plan.trajectory), *(("plant", robot.model) for robot in plan.robots)]
     for kind, part in parts:
         if type(part.made) not in KINDS[kind]:
-            return f"{part.use}: the batch engine has compiled code only for the {kind}s that are built in; use --engine inprocess"
+            return f"{part.use}: the batch engine can run only a {kind} that is built in; use --engine inprocess"
     return None
-
-
-class _Pools:
-    """The pools of constants, and how much scratch is taken."""
-
-    def __init__(self) -> None:
-        self._table: list[float] = []
-        self._index: list[int] = []
-        self.reals = self.wholes = 0
-
-    def table(self, values: Any) -> int:
-        """Returns the place of floats."""
-        self._table += np.asarray(values, dtype=float).ravel().tolist()
-        return len(self._table) - np.asarray(values).size
-
-    def index(self, values: Sequence[int]) -> int:
-        """Returns the place of integers."""
-        self._index += values
-        return len(self._index) - len(values)
-
-    def real(self, count: int) -> int:
-        """Returns the place of scratch for floats."""
-        self.reals += count
-        return self.reals - count
-
-    def whole(self, count: int) -> int:
-        """Returns the place of scratch for integers."""
-        self.wholes += count
-        return self.wholes - count
-
-    def arrays(self) -> tuple[Array, np.ndarray[Any, np.dtype[np.int64]]]:
-        """Returns both pools; neither is empty."""
-        return np.array([*self._table, 0.0]), np.array([*self._index, 0], dtype=np.int64)
 
 
 class ModelMaker:
@@ -76,10 +43,10 @@ class ModelMaker:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self.pools = _Pools()
+        self.pools = Pools()
         self._links = {(link.source, link.receiver, link.channel): at for at, link in enumerate(plan.links)}
         self._streams: dict[tuple[int, Channel], int] = {}
-        self.fractions = (*FRACTIONS, *(claim.band for claim in plan.claims))
+        self.fractions = fractions(plan)
 
     def make(self) -> r.Model:
         """Returns the arrays."""
@@ -92,12 +59,12 @@ class ModelMaker:
         run = self._run()
         table, index = pools.arrays()
         return r.Model(
-            _array(r.RUN, [run]),
-            _array(r.ROBOT, robots),
-            _array(r.NODE, nodes),
-            _array(r.BLOCK, blocks),
-            _array(r.STREAM, streams),
-            _array(r.LINK, links),
+            records_of(r.RUN, [run]),
+            records_of(r.ROBOT, robots),
+            records_of(r.NODE, nodes),
+            records_of(r.BLOCK, blocks),
+            records_of(r.STREAM, streams),
+            records_of(r.LINK, links),
             table,
             index,
         )
@@ -135,7 +102,9 @@ class ModelMaker:
         depth = 1 if link.ideal else self._depth(link.source, link.channel)
         parts = self._parts(at)
         size = 0 if link.ideal else max(first + count for first, count in parts)
-        shift = parts[0][0] if len(parts) == 1 and size else 0  # of a long message that one part of is used, keep only that
+        shift = (
+            parts[0][0] if len(parts) == 1 and size else 0
+        )  # of a long message that one part of is used, keep only that
         return {
             "stream": self._streams[link.source, link.channel],
             "ideal": link.ideal,
@@ -167,51 +136,11 @@ class ModelMaker:
         return [(part.start, length(part)) for part in slices]
 
     def _robot(self, robot: RobotPlan) -> dict[str, Any]:
-        h = robot.torque_period_ns * 1e-9
-        m, d, radius, arm = robot.mass, robot.offset, robot.wheel_radius, robot.arm
-        infinite = float("inf")
-        found = {
-            "period_ns": robot.period_ns,
-            "torque_periods": robot.period_ns // robot.torque_period_ns,
-            "limited": min(robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit) != infinite,
+        return motion_of(robot) | {
             "at": self.pools.real(r.ROBOT_REALS),
             "stream": self._streams[robot.index, Channel.STATE],
             "link": self._links[robot.parent, robot.index, Channel.COMMAND],
             "command": 2 * robot.child_number,
-            "h": h,
-            "offset": d,
-            "half_sum": m * radius / 2,
-            "half_difference": (robot.inertia - m * d * d) * radius / (d * arm) / 2,
-            "torque_limit": robot.torque_limit,
-            "torque_change": robot.torque_rate_limit * h,
-            "wheel_speed_limit": robot.wheel_speed_limit,
-            "wheel_radius": radius,
-            "arm": arm,
-            "x": robot.start[0],
-            "y": robot.start[1],
-            "heading": robot.heading,
-        }
-        plant = robot.model.made
-        if isinstance(plant, Paper):
-            per_difference = arm / ((robot.inertia - m * d**2) * radius)
-            return found | {"plant": r.PAPER, "per_sum": 1 / (m * radius), "per_difference": per_difference}
-        load, pull, resistance = 0.0, (0.0, 0.0), 0.0
-        if isinstance(plant, Hill):
-            steep = -GRAVITY / hypot(1.0, *plant.rise)
-            load, pull, resistance = plant.load, (steep * plant.rise[0], steep * plant.rise[1]), plant.resistance
-        m += load
-        inertia = robot.inertia + load * d**2
-        drag, turn_drag, lever = resistance / m, resistance * arm**2 / inertia, m * d / inertia
-        return found | {
-            "plant": r.BODY,
-            "per_sum": 1 / (m * radius),
-            "per_difference": arm / (radius * inertia),
-            "lever": lever,
-            "pull_x": pull[0],
-            "pull_y": pull[1],
-            "drag": drag,
-            "turn_drag": turn_drag,
-            "always": drag + turn_drag + sqrt(lever * hypot(*pull)),
         }
 
     def _node(self, node: NodePlan) -> dict[str, Any]:
@@ -228,7 +157,10 @@ class ModelMaker:
             "robots": node.robots,
             "links_at": pools.index(links),
             "children_at": pools.index(node.children),
-            "weights_at": pools.index(node.weights),
+            "shares_at": pools.table(
+                [w / total for w, total in zip(node.weights, accumulate(node.weights), strict=True)]
+            ),
+            "means_at": pools.table([1 / weight for weight in node.weights]),
             "bounds_at": pools.index(list(accumulate(node.weights, initial=0))),
             "carried_at": self._carried(layout, count),
             "up": self._streams.get((node.index, Channel.GROUP_STATE), -1),
@@ -342,11 +274,3 @@ class ModelMaker:
         if isinstance(made, Sine):
             return r.SINE, [*made.start, made.speed, made.amplitude, made.rate]
         return r.WAYPOINTS, [(t, *point) for t, point in zip(made.times, made.points, strict=True)]
-
-
-def _array(kind: np.dtype[np.void], rows: Sequence[dict[str, Any]]) -> np.ndarray[Any, np.dtype[np.void]]:
-    array = np.zeros(len(rows), dtype=kind)
-    for at, row in enumerate(rows):
-        for name, value in row.items():
-            array[name][at] = value
-    return array

@@ -1,9 +1,10 @@
 """How a robot moves: inverse, torque limits and plants (agents.torque and agents.plant, as arrays)."""
 
-from math import ceil, cos, isfinite, sin, sqrt
+from math import ceil, isfinite, sqrt
 from typing import Any, Final
 
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.angles import cos_sin
+from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.records import (
     COS,
     OMEGA,
@@ -23,9 +24,12 @@ from echelon.sim.batch.records import (
 
 _INNER: Final = (1 - sqrt(1 / 5)) / 2
 """Inner points of the Gauss-Lobatto rule with four points on [0, 1]: this, and 1 less this"""
+_ENDS: Final = 1 / 12
+_MIDDLE: Final = 5 / 12
+"""Its weights"""
 
 
-@compiled
+@fused
 def advance(robot: Any, real: Any, ax: float, ay: float, commanded: bool) -> None:
     """Runs torque loop and plant through one period."""
     at, h = robot.at, robot.h
@@ -38,13 +42,22 @@ def advance(robot: Any, real: Any, ax: float, ay: float, commanded: bool) -> Non
                                   ax, ay, 0.5 * h)  # fmt: skip
         if robot.limited:
             v, turning = real[at + V], robot.arm * real[at + OMEGA]
-            wanted_right, wanted_left = right, left
-            right = limit(robot, right, real[at + TAU_RIGHT], (v + turning) / robot.wheel_radius)
-            left = limit(robot, left, real[at + TAU_LEFT], (v - turning) / robot.wheel_radius)
+            last_right, last_left = real[at + TAU_RIGHT], real[at + TAU_LEFT]
+            most, change = robot.torque_limit, robot.torque_change
+            if not (
+                abs(right) <= most
+                and abs(left) <= most
+                and abs(right - last_right) <= change
+                and abs(left - last_left) <= change
+                and abs(v) + abs(turning) <= robot.speed_limit
+            ):
+                wanted_right, wanted_left = right, left
+                right = limited(robot, right, last_right, v + turning)
+                left = limited(robot, left, last_left, v - turning)
+                if right != wanted_right or left != wanted_left:
+                    saturated += 1.0
             real[at + TAU_RIGHT] = right
             real[at + TAU_LEFT] = left
-            if right != wanted_right or left != wanted_left:
-                saturated += 1.0
         if robot.plant == PAPER:
             paper_step(robot, real, right, left, h)
         else:
@@ -58,36 +71,36 @@ def advance(robot: Any, real: Any, ax: float, ay: float, commanded: bool) -> Non
     real[at + P_SATURATED] = saturated
 
 
-@compiled
+@fused
 def inverse(
     robot: Any, theta: float, v: float, omega: float, c: float, s: float, ax: float, ay: float, lead: float
 ) -> tuple[float, float]:
     """Returns the wheel torques for a wanted acceleration, for the state after `lead` [s]."""
     d = robot.offset
     v_dot = c * ax + s * ay + d * omega * omega
-    omega_dot = (c * ay - s * ax - v * omega) / d
+    omega_dot = (c * ay - s * ax - v * omega) * robot.per_offset
     theta += lead * (omega + 0.5 * lead * omega_dot)
     v += lead * v_dot
     omega += lead * omega_dot
-    c, s = cos(theta), sin(theta)
+    c, s = cos_sin(theta)
     total = robot.half_sum * (c * ax + s * ay + d * omega * omega)
     difference = robot.half_difference * (c * ay - s * ax - v * omega)
     return total + difference, total - difference
 
 
-@compiled
-def limit(robot: Any, wanted: float, last: float, wheel_speed: float) -> float:
-    """Returns the limited torque of one wheel, whose torque was `last`."""
+@fused
+def limited(robot: Any, wanted: float, last: float, speed: float) -> float:
+    """Returns the limited torque of one wheel, whose torque was `last`, and which runs over the ground with `speed` [m/s]."""
     if wanted != wanted:
         return 0.0
     tau = min(max(wanted, last - robot.torque_change), last + robot.torque_change)
     tau = min(max(tau, -robot.torque_limit), robot.torque_limit)
-    if abs(wheel_speed) > robot.wheel_speed_limit and tau * wheel_speed > 0.0:
+    if abs(speed) > robot.speed_limit and tau * speed > 0.0:
         return 0.0
     return float(tau)
 
 
-@compiled
+@fused
 def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float) -> None:
     """Moves a robot of the paper's plant through h [s]."""
     at, d = robot.at, robot.offset
@@ -96,31 +109,32 @@ def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: floa
     omega_dot = (tau_right - tau_left) * robot.per_difference
     half = 0.5 * omega_dot
     theta_1, v_1 = theta + h * (omega + half * h), v + v_dot * h
-    c_1, s_1 = cos(theta_1), sin(theta_1)
+    c_1, s_1 = cos_sin(theta_1)
     x, y = real[at + X] + d * (c_1 - c_0), real[at + Y] + d * (s_1 - s_0)
     turn = h * (abs(omega) + abs(omega_dot) * h)
     if turn <= 0.5:
         t_1, t_2 = _INNER * h, (1 - _INNER) * h
-        a_1, a_2 = theta + t_1 * (omega + half * t_1), theta + t_2 * (omega + half * t_2)
+        c_i, s_i = cos_sin(theta + t_1 * (omega + half * t_1))
+        c_j, s_j = cos_sin(theta + t_2 * (omega + half * t_2))
         v_i, v_j = v + v_dot * t_1, v + v_dot * t_2
-        ends, inner = h / 12, 5 * h / 12
-        x += ends * (v * c_0 + v_1 * c_1) + inner * (v_i * cos(a_1) + v_j * cos(a_2))
-        y += ends * (v * s_0 + v_1 * s_1) + inner * (v_i * sin(a_1) + v_j * sin(a_2))
+        ends, inner = h * _ENDS, h * _MIDDLE
+        x += ends * (v * c_0 + v_1 * c_1) + inner * (v_i * c_i + v_j * c_j)
+        y += ends * (v * s_0 + v_1 * s_1) + inner * (v_i * s_i + v_j * s_j)
     else:
         panels = 1
         if isfinite(turn):
-            panels = 16 if turn >= 8.0 else int(ceil(2 * turn))
+            panels = 16 if turn >= 8.0 else ceil(2 * turn)
         width = h / panels
-        ends, inner = width / 12, 5 * width / 12
+        ends, inner = width * _ENDS, width * _MIDDLE
         for panel in range(panels):
             for node in range(4):
                 weight = ends if node in (0, 3) else inner
                 part = 0.0 if node == 0 else (_INNER if node == 1 else (1 - _INNER if node == 2 else 1.0))
                 t = (panel + part) * width
                 along = weight * (v + v_dot * t)
-                angle = theta + t * (omega + half * t)
-                x += along * cos(angle)
-                y += along * sin(angle)
+                c, s = cos_sin(theta + t * (omega + half * t))
+                x += along * c
+                y += along * s
     real[at + X] = x
     real[at + Y] = y
     real[at + THETA] = theta_1
@@ -130,19 +144,17 @@ def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: floa
     real[at + SIN] = s_1
 
 
-@compiled
+@fused
 def body_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float) -> None:
     """Moves a rigid body, on a hill or not, through h [s]."""
     at = robot.at
     push = (tau_right + tau_left) * robot.per_sum
     turn = (tau_right - tau_left) * robot.per_difference
     x, y, theta, v, omega = real[at + X], real[at + Y], real[at + THETA], real[at + V], real[at + OMEGA]
-    pace = h * (
-        abs(omega) + robot.lever * abs(v) + sqrt(abs(turn)) + sqrt(robot.lever * abs(push)) + robot.always
-    )
+    pace = h * (abs(omega) + robot.lever * abs(v) + sqrt(abs(turn)) + sqrt(robot.lever * abs(push)) + robot.always)
     count = 1
     if isfinite(pace):
-        count = 500 if pace >= 10.0 else max(1, int(ceil(pace / 0.02)))
+        count = 500 if pace >= 10.0 else max(1, ceil(pace / 0.02))
     k = h / count
     for _ in range(count):
         a_x, a_y, a_v, a_w = _rates(robot, theta, v, omega, push, turn)
@@ -163,16 +175,16 @@ def body_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float
     real[at + THETA] = theta
     real[at + V] = v
     real[at + OMEGA] = omega
-    real[at + COS] = cos(theta)
-    real[at + SIN] = sin(theta)
+    real[at + COS], real[at + SIN] = cos_sin(theta)
 
 
-@compiled
+@fused
 def _rates(
     robot: Any, theta: float, v: float, omega: float, push: float, turn: float
 ) -> tuple[float, float, float, float]:
     """Returns the rates of x, y, v and ω; that of θ is ω."""
-    c, s, d = cos(theta), sin(theta), robot.offset
+    c, s = cos_sin(theta)
+    d = robot.offset
     return (
         v * c - d * omega * s,
         v * s + d * omega * c,

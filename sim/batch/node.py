@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.potential import add_pair_forces
 from echelon.sim.batch.streams import hear, room, say
 
 
-@compiled
+@fused
 def gather(
     node: Any, run: Any, links: Any, streams: Any, table: Any, index: Any, keys: Any, real: Any, whole: Any,
     time_ns: int, speaks: bool,
@@ -29,7 +29,7 @@ def gather(
                 real[node.state_at + here + value] = real[said + there + value]
     whole[node.has_state_at] = complete
     if complete:
-        _transform(node, run, table, index, real, time_ns)
+        _transform(node, run, table, real, time_ns)
     if speaks:
         up = streams[node.up]
         if complete:
@@ -39,12 +39,13 @@ def gather(
         say(up, whole, time_ns, 1 - complete)
 
 
-@compiled
-def _transform(node: Any, run: Any, table: Any, index: Any, real: Any, time_ns: int) -> None:
+@fused
+def _transform(node: Any, run: Any, table: Any, real: Any, time_ns: int) -> None:
     """Computes shape variables, centroid and their errors, (e_x, e_y, ė_x, ė_y) of each, and the node's own part of its
     GROUP_STATE."""
     count, e, state = node.count, node.e_at, node.state_at
-    to_shape(count, 4, index, node.weights_at, real, node.s_at, e)
+    to_shape(node, 4, table, real, node.s_at, e)
+    to_shape(node, 4, table, real, node.s_at + 2, e + 2)
     centroid = e + 4 * (count - 1)
     for value in range(4):
         real[state + value] = real[centroid + value]
@@ -68,7 +69,7 @@ def _transform(node: Any, run: Any, table: Any, index: Any, real: Any, time_ns: 
             real[state + node.centroid_rates + 1] = real[centroid + 3]
 
 
-@compiled
+@fused
 def steer(
     node: Any, run: Any, blocks: Any, links: Any, streams: Any, table: Any, index: Any, keys: Any, real: Any, whole: Any,
     time_ns: int,
@@ -96,7 +97,7 @@ def steer(
         rates = -1
     f_pot = -1
     if run.avoidance:
-        _add_forces(node, run, index, real, forces)
+        _add_forces(node, run, table, index, real, forces)
         f_pot = node.f_pot_at
     _accelerate(node, run, blocks, table, index, real, rates, f_pot)
     if node.command >= 0:
@@ -120,29 +121,27 @@ def steer(
         say(reference, whole, time_ns, 0)
 
 
-@compiled
-def _add_forces(node: Any, run: Any, index: Any, real: Any, parent_forces: int) -> None:
+@fused
+def _add_forces(node: Any, run: Any, table: Any, index: Any, real: Any, parent_forces: int) -> None:
     """Computes the forces on the robots below, those from above included, and F_pot of the node's blocks."""
     for value in range(2 * node.robots):
         real[node.forces_at + value] = real[parent_forces + value] if parent_forces >= 0 else 0.0
     add_pair_forces(node, run, index, real)
     robot = node.forces_at
     for child in range(node.count):
-        weight = index[node.weights_at + child]
         x = y = 0.0
-        for _ in range(weight):
+        for _ in range(index[node.bounds_at + child], index[node.bounds_at + child + 1]):
             x += real[robot]
             y += real[robot + 1]
             robot += 2
-        real[node.a_at + 2 * child] = x / weight
-        real[node.a_at + 2 * child + 1] = y / weight
-    to_shape(node.count, 2, index, node.weights_at, real, node.a_at, node.f_pot_at)
+        share = table[node.means_at + child]
+        real[node.a_at + 2 * child] = x * share
+        real[node.a_at + 2 * child + 1] = y * share
+    to_shape(node, 2, table, real, node.a_at, node.f_pot_at)
 
 
-@compiled
-def _accelerate(
-    node: Any, run: Any, blocks: Any, table: Any, index: Any, real: Any, rates: int, f_pot: int
-) -> None:
+@fused
+def _accelerate(node: Any, run: Any, blocks: Any, table: Any, index: Any, real: Any, rates: int, f_pot: int) -> None:
     """Computes the children's accelerations."""
     shape = 2 * (node.count - 1)
     if shape > 0:
@@ -157,4 +156,4 @@ def _accelerate(
     else:
         real[centroid] = real[node.c_at]
         real[centroid + 1] = real[node.c_at + 1]
-    to_children(node.count, index, node.weights_at, node.robots, real, node.eta_at, node.a_at)
+    to_children(node, table, real, node.eta_at, node.a_at)

@@ -3,10 +3,10 @@
 from math import sqrt
 from typing import Any
 
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.compiled import fused
 
 
-@compiled
+@fused
 def add_pair_forces(node: Any, run: Any, index: Any, real: Any) -> None:
     """Adds ∇f of all pairs of robots below different children of a node to the forces on its robots."""
     positions, forces = node.state_at + node.positions, node.forces_at
@@ -27,7 +27,7 @@ def add_pair_forces(node: Any, run: Any, index: Any, real: Any) -> None:
                     real[forces + 2 * other + 1] -= fy
 
 
-@compiled
+@fused
 def _force(run: Any, dx: float, dy: float, q: float) -> tuple[float, float]:
     """Returns the force on the first of two robots that are (dx, dy) apart, √q within the sensing radius."""
     sensing, avoidance = run.sensing_radius * run.sensing_radius, run.avoidance_radius * run.avoidance_radius

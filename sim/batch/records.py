@@ -1,6 +1,6 @@
 """What a plan is as arrays: one record for the run, and one for each robot, node, block, stream and link.
 
-Matrices and lists of any length are in two pools: `table` of floats and `index` of integers.  A field that ends in `_at` says
+Matrices and lists of any length are in two pools: `table` of floats and `indices` of integers.  A field that ends in `_at` says
 where in a pool, or where in the scratch of a run, its part begins.  -1 means that there is none.
 
 The scratch of a run is two arrays: `real` of floats and `whole` of integers.
@@ -32,12 +32,12 @@ ROBOT: Final = _record(
     "period_ns torque_periods plant limited at stream link command",
     # plant and inverse (agents.plant, agents.torque); lever to always: of the rigid body
     "h per_sum per_difference offset half_sum half_difference lever pull_x pull_y drag turn_drag always "
-    "torque_limit torque_change wheel_speed_limit wheel_radius arm x y heading",
+    "per_offset torque_limit torque_change speed_limit arm x y heading",
 )
 NODE: Final = _record(
-    # number of children and of robots below; in `index` links from the children, their indices and weights, the bounds of
-    # their robots, and what of their messages is carried up
-    "period_ns parent_period_ns count robots links_at children_at weights_at bounds_at carried_at "
+    # number of children and of robots below; in `table` w_k/(w_1 + … + w_k) and 1/w_k of each child k; in `indices` links from
+    # the children, their indices, the bounds of their robots, and what of their messages is carried up
+    "period_ns parent_period_ns count robots shares_at means_at links_at children_at bounds_at carried_at "
     # streams that it sends, the link from its parent, and places in its parent's REFERENCE
     "up reference command link acceleration parent_rates parent_forces "
     # its block, and its desired shape in `table`; scratch: s, e, acceleration of its centroid, η, accelerations, F_pot
@@ -47,7 +47,7 @@ NODE: Final = _record(
     "",
 )
 BLOCK: Final = _record(
-    # gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in `index`, values in `table`
+    # gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in `indices`, values in `table`
     "size diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
     "sigma ahead period bound",
 )
@@ -107,4 +107,4 @@ class Model(NamedTuple):
     streams: NDArray[np.void]
     links: NDArray[np.void]
     table: NDArray[np.float64]
-    index: NDArray[np.int64]
+    indices: NDArray[np.int64]

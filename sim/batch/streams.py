@@ -31,7 +31,7 @@ from echelon.sim.batch.records import (
 @compiled
 def room(stream: Any, whole: Any) -> int:
     """Returns where in `real` the values of the stream's next message belong."""
-    return stream.at + (whole[stream.marks_at] & stream.mask) * stream.size
+    return int(stream.at + (whole[stream.marks_at] & stream.mask) * stream.size)
 
 
 @compiled
@@ -100,7 +100,9 @@ def _take(link: Any, stream: Any, key: Any, real: Any, whole: Any) -> None:
 def fate(link: Any, number: int, key: Any, real: Any) -> int:
     """Returns the delay of a message [ns], or -1 if it is lost.  Must be called with ascending numbers from 0 on."""
     draws = link.draws_at
-    if number % 2 == 0:  # each count of the generator has two words for each of two messages; numpy's counts begin with 1
+    if (
+        number % 2 == 0
+    ):  # each count of the generator has two words for each of two messages; numpy's counts begin with 1
         a, b, c, d = philox(key[0], key[1], np.uint64(number // 2 + 1))
         real[draws] = uniform(a)
         real[draws + 1] = uniform(b)
@@ -116,7 +118,7 @@ def fate(link: Any, number: int, key: Any, real: Any) -> int:
 @compiled
 def _rounded(value: float) -> int:
     """Returns the nearest integer of a value that is not negative; the even one of two."""
-    below = int(floor(value))
+    below = floor(value)
     rest = value - below
     return below + int(rest > 0.5 or (rest == 0.5 and below % 2 == 1))
 

@@ -1,9 +1,9 @@
 """One whole run, and many of them: what a thread of the batch engine does."""
 
 from math import cos, isfinite, sin
-from typing import Any
+from typing import Any, Final
 
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.compiled import compiled, is_kept
 from echelon.sim.batch.measures import measure
 from echelon.sim.batch.motion import advance
 from echelon.sim.batch.node import gather, steer
@@ -19,7 +19,6 @@ from echelon.sim.batch.records import (
     P_PEAK,
     P_RIGHT,
     P_SATURATED,
-    ROBOT_REALS,
     S_LATE,
     S_LEFT,
     S_PEAK,
@@ -34,8 +33,10 @@ from echelon.sim.batch.records import (
 )
 from echelon.sim.batch.streams import hear, room, say
 
-STARTED_NS = 1_000_000_000
+STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
+
+__all__ = ["is_kept", "many_runs", "whole_run"]
 
 
 @compiled
@@ -47,7 +48,7 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
     7), or (0, robots, 7) if they are not wanted."""
     run = model.run[0]
     robots, nodes, blocks, streams, links = model.robots, model.nodes, model.blocks, model.streams, model.links
-    table, index = model.table, model.index
+    table, index = model.table, model.indices
     _start(run, robots, blocks, links, real, whole)
     lost_ns = -1
     instant = 0
@@ -55,9 +56,9 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
     for time_ns in range(0, run.duration_ns + 1, run.tick_ns):
         for number in range(len(robots)):
             robot = robots[number]
-            if time_ns == whole[run.due_at + number]:
-                if not _say_state(robot, streams[robot.stream], real, whole, time_ns):
-                    lost_ns = time_ns
+            due = time_ns == whole[run.due_at + number]
+            if due and not _say_state(robot, streams[robot.stream], real, whole, time_ns):
+                lost_ns = time_ns
         if time_ns % run.common_ns == 0:
             measure(run, robots, nodes, blocks, table, index, real, whole, time_ns, time_ns - measured_ns)
             measured_ns = time_ns
@@ -140,13 +141,14 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
 
 
 @compiled
-def many_runs(model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, reals: Any, wholes: Any, traces: Any,
-              lost_ns: Any, kept_reals: Any, kept_wholes: Any) -> None:  # fmt: skip
-    """Runs number `first` to `last` - 1; of each keeps the parts of its scratch that are results.
-
-    `kept_reals`, `kept_wholes`: places in `real` and `whole` that go to `reals[run]` and `wholes[run]`."""
+def many_runs(
+    model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, traces: Any, lost_ns: Any,
+    kept_reals: Any, kept_wholes: Any, reals: Any, wholes: Any,
+) -> None:  # fmt: skip
+    """Runs number `first` to `last` - 1; copies the results of each from the scratch (`real`, `whole`) to `reals[number]` and
+    `wholes[number]`."""
     for number in range(first, last):
-        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[number if number < len(traces) else 0])
+        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)])
         for place in range(len(kept_reals)):
             reals[number, place] = real[kept_reals[place]]
         for place in range(len(kept_wholes)):

@@ -72,8 +72,9 @@ def run_many(
     return outcomes(plan, model, seeds, lost_ns, reals, wholes, traced if traces else None)
 
 
-def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.uint64]:
-    """Returns the Philox key of each link for each seed, (seeds, links, 2); zero for ideal links, which draw nothing."""
+def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.int64]:
+    """Returns the bits of the Philox key of each link for each seed, (seeds, links, 2); zero for ideal links, which draw
+    nothing."""
     names = [one.name for one in plan.all_roles]
     keys = np.zeros((len(seeds), max(1, len(plan.links)), 2), dtype=np.uint64)
     lossy = [(at, link) for at, link in enumerate(plan.links) if not link.ideal]
@@ -81,4 +82,4 @@ def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.uint64]:
         for at, link in lossy:
             key = link_key(seed, names[link.source], names[link.receiver], link.channel)
             keys[row, at] = key & (2**64 - 1), key >> 64
-    return keys
+    return keys.view(np.int64)

@@ -11,6 +11,7 @@ from typing import Any
 
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, to_shape
+from echelon.sim.batch.potential import sort_along
 from echelon.sim.batch.records import (
     BLOCK_WHOLES,
     M_FINITE,
@@ -108,27 +109,41 @@ def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, 
             real[now + 2 * robot + 1] - real[before + 2 * robot + 1],
         )
         fastest = max(fastest, dx * dx + dy * dy)
-    least, radius = real[run.distance_at], run.avoidance_radius * run.avoidance_radius
-    reach = (sqrt(max(least, radius)) + 2 * sqrt(fastest)) ** 2
-    for one in range(robots):
-        x_0, y_0 = real[before + 2 * one], real[before + 2 * one + 1]
-        for other in range(one + 1, robots):
-            x, y = real[before + 2 * other] - x_0, real[before + 2 * other + 1] - y_0
-            square = x * x + y * y
-            if square > reach:
-                continue
-            dx = real[now + 2 * other] - real[now + 2 * one] - x
-            dy = real[now + 2 * other + 1] - real[now + 2 * one + 1] - y
-            change = dx * dx + dy * dy
-            along = 0.0
-            if change > 0.0:
-                along = min(max(-(x * dx + y * dy) / change, 0.0), 1.0)
-            between = (x + along * dx) ** 2 + (y + along * dy) ** 2
-            nearest = min(between, square)
-            if nearest < real[run.distance_at]:
-                real[run.distance_at] = nearest
-                whole[run.closest_at] = one
-                whole[run.closest_at + 1] = other
-                whole[run.closest_at + 2] = time_ns - step_ns + round(along * step_ns)
-            if nearest <= radius and (step_ns == 0 or square > radius):
-                whole[run.closest_at + 3] += 1
+    radius = run.avoidance_radius * run.avoidance_radius
+    reach = sqrt(max(real[run.distance_at], radius)) + 2 * sqrt(fastest)
+    order = run.order_at
+    axis = sort_along(robots, before, order, real, whole)
+    for place in range(robots - 1):
+        one = whole[order + place]
+        x, y = real[before + 2 * one], real[before + 2 * one + 1]
+        last = x + reach if axis == 0 else y + reach
+        for later in range(place + 1, robots):
+            other = whole[order + later]
+            if axis >= 0 and real[before + 2 * other + axis] > last:
+                break
+            x_apart, y_apart = real[before + 2 * other] - x, real[before + 2 * other + 1] - y
+            if x_apart * x_apart + y_apart * y_apart <= reach * reach:
+                _note_distance(run, one, other, real, whole, time_ns, step_ns)
+
+
+@fused
+def _note_distance(run: Any, one: int, other: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
+    """Notes how close two robots came since the last instant."""
+    now, before, radius = run.places_at, run.before_at, run.avoidance_radius * run.avoidance_radius
+    x = real[before + 2 * other] - real[before + 2 * one]
+    y = real[before + 2 * other + 1] - real[before + 2 * one + 1]
+    square = x * x + y * y
+    dx = real[now + 2 * other] - real[now + 2 * one] - x
+    dy = real[now + 2 * other + 1] - real[now + 2 * one + 1] - y
+    change = dx * dx + dy * dy
+    along = 0.0
+    if change > 0.0:
+        along = min(max(-(x * dx + y * dy) / change, 0.0), 1.0)
+    nearest = min((x + along * dx) ** 2 + (y + along * dy) ** 2, square)
+    if nearest < real[run.distance_at]:
+        real[run.distance_at] = nearest
+        whole[run.closest_at] = min(one, other)
+        whole[run.closest_at + 1] = max(one, other)
+        whole[run.closest_at + 2] = time_ns - step_ns + round(along * step_ns)
+    if nearest <= radius and (step_ns == 0 or square > radius):
+        whole[run.closest_at + 3] += 1

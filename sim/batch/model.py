@@ -1,5 +1,6 @@
 """From a plan to arrays (`records`): once for each plan, before its runs."""
 
+from collections.abc import Mapping
 from itertools import accumulate
 from math import gcd, lcm
 from typing import Any, Final
@@ -52,7 +53,9 @@ class ModelMaker:
         """Returns the arrays."""
         plan, pools = self.plan, self.pools
         streams = [self._stream(source, channel) for source, channel in self._sources()]
-        links = [self._link(at) for at in range(len(plan.links))]
+        links = [
+            self._link(at, streams[self._streams[link.source, link.channel]]) for at, link in enumerate(plan.links)
+        ]
         robots = [self._robot(robot) for robot in plan.robots]
         nodes = [self._node(node) for node in plan.nodes]
         blocks = [self._block(block) for block in plan.blocks]
@@ -97,28 +100,30 @@ class ModelMaker:
             "marks_at": self.pools.whole(1 + 2 * depth),
         }
 
-    def _link(self, at: int) -> dict[str, Any]:
+    def _link(self, at: int, stream: Mapping[str, Any]) -> dict[str, Any]:
         link, pools = self.plan.links[at], self.pools
-        depth = 1 if link.ideal else self._depth(link.source, link.channel)
         parts = self._parts(at)
         size = 0 if link.ideal else max(first + count for first, count in parts)
         shift = (
             parts[0][0] if len(parts) == 1 and size else 0
         )  # of a long message that one part of is used, keep only that
-        return {
-            "stream": self._streams[link.source, link.channel],
+        record = {
+            "size": stream["size"],
+            "mask": stream["mask"],
+            "stream_at": stream["at"],
+            "stream_marks_at": stream["marks_at"],
             "ideal": link.ideal,
             "delay_min_ns": link.delay_min_ns,
             "delay_span_ns": link.delay_max_ns - link.delay_min_ns,
             "timeout_ns": link.timeout_ns,
-            "mask": depth - 1,
             "at": pools.real(size - shift) - shift,
             "draws_at": pools.real(0 if link.ideal else 4),
-            "parts_at": pools.index([number for part in parts for number in part]),
-            "parts": len(parts),
-            "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.ideal else depth)),
+            "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.ideal else stream["mask"] + 1)),
             "loss": link.loss,
         }
+        for number, (first, count) in enumerate(parts, start=1):
+            record |= {f"first_{number}": first, f"size_{number}": count}
+        return record
 
     def _parts(self, at: int) -> list[tuple[int, int]]:
         """Returns what a receiver uses of the messages of a link: places and lengths."""
@@ -162,6 +167,7 @@ class ModelMaker:
             ),
             "means_at": pools.table([1 / weight for weight in node.weights]),
             "bounds_at": pools.index(list(accumulate(node.weights, initial=0))),
+            "child_of_at": pools.index([child for child, weight in enumerate(node.weights) for _ in range(weight)]),
             "carried_at": self._carried(layout, count),
             "up": self._streams.get((node.index, Channel.GROUP_STATE), -1),
             "reference": self._streams.get((node.index, Channel.REFERENCE), -1),
@@ -179,6 +185,7 @@ class ModelMaker:
             "a_at": pools.real(2 * count),
             "f_pot_at": pools.real(2 * count),
             "forces_at": pools.real(2 * node.robots if plan.avoidance.enabled else 0),
+            "order_at": pools.whole(node.robots + 1 if plan.avoidance.enabled else 0),
             "state_at": pools.real(state.size),
             "has_state_at": pools.whole(1),
             "own_rates": state.own_rates.start if coupled else -1,
@@ -253,6 +260,7 @@ class ModelMaker:
             "due_at": pools.whole(len(plan.formation)),
             "places_at": pools.real(2 * len(plan.formation)),
             "before_at": pools.real(2 * len(plan.robots)),
+            "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),
             "closest_at": pools.whole(4),
             "avoidance_radius": avoidance.avoidance_radius,

@@ -10,14 +10,14 @@ from echelon.sim.batch.streams import hear, room, say
 
 @fused
 def gather(
-    node: Any, run: Any, links: Any, streams: Any, table: Any, index: Any, keys: Any, real: Any, whole: Any,
+    node: Any, run: Any, links: Any, streams: Any, table: Any, index: Any, real: Any, whole: Any,
     time_ns: int, speaks: bool,
 ) -> None:  # fmt: skip
     """Takes the children's states at `time_ns`; sends the GROUP_STATE if the node `speaks` to its parent in this period."""
     count = node.count
     complete = 1
     for child in range(count):
-        said = hear(index[node.links_at + child], links, streams, index, keys, real, whole, time_ns)
+        said = hear(links[index[node.links_at + child]], real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -71,14 +71,14 @@ def _transform(node: Any, run: Any, table: Any, real: Any, time_ns: int) -> None
 
 @fused
 def steer(
-    node: Any, run: Any, blocks: Any, links: Any, streams: Any, table: Any, index: Any, keys: Any, real: Any, whole: Any,
+    node: Any, run: Any, blocks: Any, links: Any, streams: Any, table: Any, index: Any, real: Any, whole: Any,
     time_ns: int,
 ) -> None:  # fmt: skip
     """Takes the parent's reference at `time_ns`; sends REFERENCE and COMMAND to the children."""
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
-        said = hear(node.link, links, streams, index, keys, real, whole, time_ns)
+        said = hear(links[node.link], real, whole, time_ns)
         if said < 0:
             complete = 0
         else:
@@ -97,7 +97,7 @@ def steer(
         rates = -1
     f_pot = -1
     if run.avoidance:
-        _add_forces(node, run, table, index, real, forces)
+        _add_forces(node, run, table, index, real, whole, forces)
         f_pot = node.f_pot_at
     _accelerate(node, run, blocks, table, index, real, rates, f_pot)
     if node.command >= 0:
@@ -122,11 +122,11 @@ def steer(
 
 
 @fused
-def _add_forces(node: Any, run: Any, table: Any, index: Any, real: Any, parent_forces: int) -> None:
+def _add_forces(node: Any, run: Any, table: Any, index: Any, real: Any, whole: Any, parent_forces: int) -> None:
     """Computes the forces on the robots below, those from above included, and F_pot of the node's blocks."""
     for value in range(2 * node.robots):
         real[node.forces_at + value] = real[parent_forces + value] if parent_forces >= 0 else 0.0
-    add_pair_forces(node, run, index, real)
+    add_pair_forces(node, run, index, real, whole)
     robot = node.forces_at
     for child in range(node.count):
         x = y = 0.0

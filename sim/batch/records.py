@@ -22,9 +22,9 @@ def _record(wholes: str, reals: str) -> np.dtype[np.void]:
 RUN: Final = _record(
     # instants [ns]; whether robots avoid each other; law and trajectory (below), the trajectory's numbers in `table`
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
-    # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and those of robots before; square of
-    # the smallest distance; the pair and its instant, then the number of violations
-    "due_at places_at before_at distance_at closest_at",
+    # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and those of robots before, and their
+    # order (potential); square of the smallest distance; the pair and its instant, then the number of violations
+    "due_at places_at before_at order_at distance_at closest_at",
     "avoidance_radius sensing_radius force_limit floor gamma beta kappa",
 )
 ROBOT: Final = _record(
@@ -36,12 +36,13 @@ ROBOT: Final = _record(
 )
 NODE: Final = _record(
     # number of children and of robots below; in `table` w_k/(w_1 + … + w_k) and 1/w_k of each child k; in `indices` links from
-    # the children, their indices, the bounds of their robots, and what of their messages is carried up
-    "period_ns parent_period_ns count robots shares_at means_at links_at children_at bounds_at carried_at "
+    # the children, their indices, the bounds of their robots, each robot's child, and what of their messages is carried up
+    "period_ns parent_period_ns count robots shares_at means_at links_at children_at bounds_at child_of_at carried_at "
     # streams that it sends, the link from its parent, and places in its parent's REFERENCE
     "up reference command link acceleration parent_rates parent_forces "
-    # its block, and its desired shape in `table`; scratch: s, e, acceleration of its centroid, η, accelerations, F_pot
-    "block desired_at s_at e_at c_at eta_at a_at f_pot_at forces_at "
+    # its block, and its desired shape in `table`; scratch: s, e, acceleration of its centroid, η, accelerations, F_pot, forces,
+    # and its robots in order (potential)
+    "block desired_at s_at e_at c_at eta_at a_at f_pot_at forces_at order_at "
     # its GROUP_STATE, whether it has one, and places in it
     "state_at has_state_at own_rates centroid_rates rates rates_size positions",
     "",
@@ -58,8 +59,10 @@ STREAM: Final = _record(
     "",
 )
 LINK: Final = _record(
-    # `at`: the message in use in `real`; `draws_at`: draws of two messages; `parts`: what the receiver uses of a message
-    "stream ideal delay_min_ns delay_span_ns timeout_ns mask at draws_at parts_at parts marks_at",
+    # its stream, as above; `at`: the message in use in `real`; `draws_at`: draws of two messages; places and sizes of the parts
+    # that the receiver uses of a message
+    "size mask stream_at stream_marks_at ideal delay_min_ns delay_span_ns timeout_ns at draws_at marks_at "
+    "first_1 size_1 first_2 size_2 first_3 size_3",
     "loss",
 )
 
@@ -79,8 +82,10 @@ S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(13, 19)
 ROBOT_REALS: Final = 19
 
 # Places in a link's part of `whole`.
-TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, USED, HELD, AGE_SUM, AGE_MAX, NEXT, OLDEST = range(13)
-LINK_WHOLES: Final = 13
+TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, USED, HELD, AGE_SUM, AGE_MAX, NEXT, OLDEST, KEY_0, KEY_1 = range(
+    15
+)
+LINK_WHOLES: Final = 15
 """After these come the arrivals of the messages in flight [ns]"""
 COUNTS: Final = (TAKEN, DELIVERED, LOST, USED, HELD, AGE_SUM, AGE_MAX)
 """What of these is a result"""

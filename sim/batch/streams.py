@@ -17,6 +17,8 @@ from echelon.sim.batch.records import (
     HELD,
     IN_USE,
     IS_NULL,
+    KEY_0,
+    KEY_1,
     LAST,
     LINK_WHOLES,
     LOST,
@@ -45,22 +47,20 @@ def say(stream: Any, whole: Any, time_ns: int, is_null: int) -> None:
 
 
 @compiled
-def hear(at: int, links: Any, streams: Any, index: Any, keys: Any, real: Any, whole: Any, time_ns: int) -> int:
-    """Returns where in `real` the values of the message in use on link number `at` are at `time_ns`, or -1 if none is in use;
-    counts the use.  Must be called with ascending instants."""
-    link = links[at]
-    stream = streams[link.stream]
+def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
+    """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
+    use.  Must be called with ascending instants."""
     marks = link.marks_at
     if link.ideal:
-        number = whole[stream.marks_at] - 1
+        number = whole[link.stream_marks_at] - 1
         whole[marks + TAKEN] = number + 1
-        mark = stream.marks_at + 1 + 2 * (number & stream.mask)
+        mark = link.stream_marks_at + 1 + 2 * (number & link.mask)
         stamp, is_null = whole[mark], whole[mark + 1]
-        place = stream.at + (number & stream.mask) * stream.size
+        place = link.stream_at + (number & link.mask) * link.size
     else:
-        _take(link, stream, keys[at], real, whole)
+        _take(link, real, whole)
         if whole[marks + NEXT] <= time_ns:
-            _receive(link, stream, index, real, whole, time_ns)
+            _receive(link, real, whole, time_ns)
         number, stamp, is_null = whole[marks + IN_USE], whole[marks + STAMP], whole[marks + IS_NULL]
         place = link.at
     age = time_ns - stamp
@@ -78,13 +78,13 @@ def hear(at: int, links: Any, streams: Any, index: Any, keys: Any, real: Any, wh
 
 
 @compiled
-def _take(link: Any, stream: Any, key: Any, real: Any, whole: Any) -> None:
+def _take(link: Any, real: Any, whole: Any) -> None:
     """Draws what becomes of the messages that were sent since the last call."""
     marks = link.marks_at
     number = whole[marks + TAKEN]
-    while number < whole[stream.marks_at]:
-        sent_ns = whole[stream.marks_at + 1 + 2 * (number & stream.mask)]
-        delay_ns = fate(link, number, key, real)
+    while number < whole[link.stream_marks_at]:
+        sent_ns = whole[link.stream_marks_at + 1 + 2 * (number & link.mask)]
+        delay_ns = fate(link, number, real, whole)
         arrival = marks + LINK_WHOLES + (number & link.mask)
         if delay_ns < 0:
             whole[marks + LOST] += 1
@@ -97,13 +97,14 @@ def _take(link: Any, stream: Any, key: Any, real: Any, whole: Any) -> None:
 
 
 @compiled
-def fate(link: Any, number: int, key: Any, real: Any) -> int:
+def fate(link: Any, number: int, real: Any, whole: Any) -> int:
     """Returns the delay of a message [ns], or -1 if it is lost.  Must be called with ascending numbers from 0 on."""
     draws = link.draws_at
     if (
         number % 2 == 0
     ):  # each count of the generator has two words for each of two messages; numpy's counts begin with 1
-        a, b, c, d = philox(key[0], key[1], np.uint64(number // 2 + 1))
+        key_0, key_1 = np.uint64(whole[link.marks_at + KEY_0]), np.uint64(whole[link.marks_at + KEY_1])
+        a, b, c, d = philox(key_0, key_1, np.uint64(number // 2 + 1))
         real[draws] = uniform(a)
         real[draws + 1] = uniform(b)
         real[draws + 2] = uniform(c)
@@ -124,7 +125,7 @@ def _rounded(value: float) -> int:
 
 
 @compiled
-def _receive(link: Any, stream: Any, index: Any, real: Any, whole: Any, time_ns: int) -> None:
+def _receive(link: Any, real: Any, whole: Any, time_ns: int) -> None:
     """Counts the messages that have arrived by `time_ns`, and takes the newest of them into use if it is newer than the one in
     use."""
     marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
@@ -147,13 +148,18 @@ def _receive(link: Any, stream: Any, index: Any, real: Any, whole: Any, time_ns:
     whole[marks + NEXT] = next_ns
     if newest <= whole[marks + IN_USE]:
         return
-    mark = stream.marks_at + 1 + 2 * (newest & stream.mask)
+    mark = link.stream_marks_at + 1 + 2 * (newest & link.mask)
     whole[marks + IN_USE] = newest
     whole[marks + STAMP] = whole[mark]
     whole[marks + IS_NULL] = whole[mark + 1]
     if whole[mark + 1] == 0:
-        source = stream.at + (newest & stream.mask) * stream.size
-        for part in range(link.parts):
-            first = index[link.parts_at + 2 * part]
-            for value in range(first, first + index[link.parts_at + 2 * part + 1]):
-                real[link.at + value] = real[source + value]
+        source = link.stream_at + (newest & link.mask) * link.size
+        _copy(real, source + link.first_1, link.at + link.first_1, link.size_1)
+        _copy(real, source + link.first_2, link.at + link.first_2, link.size_2)
+        _copy(real, source + link.first_3, link.at + link.first_3, link.size_3)
+
+
+@compiled
+def _copy(real: Any, source: int, place: int, size: int) -> None:
+    for value in range(size):
+        real[place + value] = real[source + value]

@@ -11,6 +11,8 @@ from echelon.sim.batch.records import (
     COS,
     FAR,
     IN_USE,
+    KEY_0,
+    KEY_1,
     LAST,
     M_FINITE,
     NEXT,
@@ -44,12 +46,12 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
     """Runs a plan; returns the instant at which a robot's state is not finite [ns], or -1.  What is measured is in `real` and
     `whole` then.
 
-    `keys`: the Philox key of each link, (links, 2).  `trace`: states of the robots at the instants that all share, (T, robots,
-    7), or (0, robots, 7) if they are not wanted."""
+    `keys`: the Philox key of each link, (links, 2), the bits of its words as integers.  `trace`: states of the robots at the
+    instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted."""
     run = model.run[0]
     robots, nodes, blocks, streams, links = model.robots, model.nodes, model.blocks, model.streams, model.links
     table, index = model.table, model.indices
-    _start(run, robots, blocks, links, real, whole)
+    _start(run, robots, nodes, blocks, links, keys, real, whole)
     lost_ns = -1
     instant = 0
     measured_ns = 0
@@ -73,16 +75,16 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
             node = nodes[number]
             if time_ns == whole[run.due_at + len(robots) + number]:
                 speaks = node.up >= 0 and time_ns % node.parent_period_ns == 0
-                gather(node, run, links, streams, table, index, keys, real, whole, time_ns, speaks)
+                gather(node, run, links, streams, table, index, real, whole, time_ns, speaks)
         for number in range(len(nodes) - 1, -1, -1):
             due = run.due_at + len(robots) + number
             if time_ns == whole[due]:
-                steer(nodes[number], run, blocks, links, streams, table, index, keys, real, whole, time_ns)
+                steer(nodes[number], run, blocks, links, streams, table, index, real, whole, time_ns)
                 whole[due] += nodes[number].period_ns
         for number in range(len(robots)):
             if time_ns == whole[run.due_at + number]:
                 robot = robots[number]
-                said = hear(robot.link, links, streams, index, keys, real, whole, time_ns)
+                said = hear(links[robot.link], real, whole, time_ns)
                 if said < 0:
                     advance(robot, real, 0.0, 0.0, False)
                 else:
@@ -93,7 +95,7 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
 
 
 @compiled
-def _start(run: Any, robots: Any, blocks: Any, links: Any, real: Any, whole: Any) -> None:
+def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any, real: Any, whole: Any) -> None:
     for place in range(len(real)):
         real[place] = 0.0
     for place in range(len(whole)):
@@ -109,12 +111,19 @@ def _start(run: Any, robots: Any, blocks: Any, links: Any, real: Any, whole: Any
         marks = links[number].marks_at
         whole[marks + IN_USE] = whole[marks + LAST] = -1
         whole[marks + NEXT] = FAR
+        whole[marks + KEY_0], whole[marks + KEY_1] = keys[number, 0], keys[number, 1]
     for number in range(len(blocks)):
         marks = blocks[number].marks_at
         whole[marks + M_FINITE] = 1
         for mark in range(run.fractions + 1):
             whole[marks + M_FINITE + 1 + mark] = -1
     real[run.distance_at] = 1e300
+    for place in range(len(robots)):
+        whole[run.order_at + place] = place
+    if run.avoidance:
+        for number in range(len(nodes)):
+            for place in range(nodes[number].robots):
+                whole[nodes[number].order_at + place] = place
 
 
 @compiled

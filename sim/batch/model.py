@@ -1,6 +1,7 @@
 """From a plan to arrays (`records`): once for each plan, before its runs."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from itertools import accumulate
 from math import gcd, lcm
 from typing import Any, Final
@@ -28,15 +29,35 @@ KINDS: Final = {
 }
 
 
+_LINK: Final = frozenset({
+    "source", "receiver", "channel", "period_ns", "delay_min_ns", "delay_max_ns", "loss", "timeout_ns", "first_ns", "size",
+    "name", "policy", "punctual",
+})  # fmt: skip
+"""What this engine knows of a link"""
+_POLICIES: Final = ("hold", "hold_then_stop")
+
+
 def refusal(plan: Plan) -> str | None:
     """Returns why this engine cannot run a plan, and which engine can; None if it can."""
+    return next((f"{why}; use --engine inprocess" for why in _reasons(plan)), None)
+
+
+def _reasons(plan: Plan) -> Iterator[str]:
     if plan.can.closed:
-        return "can.path = 'closed': the batch engine has no bus and no drives; use --engine inprocess"
+        yield "can.path = 'closed': the batch engine has no bus and no drives"
     parts = [("law", plan.law), ("trajectory", plan.trajectory), *(("plant", robot.model) for robot in plan.robots)]
     for kind, part in parts:
         if type(part.made) not in KINDS[kind]:
-            return f"{part.use}: the batch engine can run only a {kind} that is built in; use --engine inprocess"
-    return None
+            yield f"{part.use}: the batch engine can run only a {kind} that is built in"
+    for link in plan.links:
+        for field in fields(link):
+            if field.name not in _LINK and getattr(link, field.name) != field.default:
+                yield f"links: the batch engine does not know {field.name}"
+        if getattr(link, "policy", "hold") not in _POLICIES:
+            yield f"links: the batch engine knows the policies {' and '.join(_POLICIES)} only"
+    late = not all(link.ideal for link in plan.links)
+    if late and any(getattr(one, "event_driven", False) for one in plan.formation):
+        yield "timing = 'event_driven': the batch engine knows late links only where timing = 'time_driven'"
 
 
 class ModelMaker:

@@ -1,4 +1,4 @@
-"""`python -m bench`: the lockstep beside its peers, whole runs, then the CAN bus, in one go on one machine."""
+"""`python -m bench`: measures the lockstep and other ways to run it, whole runs, and the CAN bus, one after the other."""
 
 import argparse
 import json
@@ -9,7 +9,7 @@ from bench import can, lockstep, product
 
 
 def main() -> int:
-    """Measures and prints everything; the exit code is 1 if a peer failed."""
+    """Measures everything and prints it; returns the exit code: 1 if a peer failed, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m bench", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
         "--ticks", type=int, default=2000, help="ticks of a lockstep; slow peers run a fifth (default 2000)"

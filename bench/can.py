@@ -1,8 +1,8 @@
-"""What the way to the bus costs beside python-can's own: `python -m bench.can`.  Then runs with a closed torque path.
+"""Speed of the CAN bus compared with python-can alone, and of runs with a closed torque path: `python -m bench.can`.
 
-Sent: the torques of lab.toml's nine robots through envelope, host and bus, against a plain loop over the same frames
-with python-can's `bus.send(can.Message(…))`.  Received: bursts, by our bus and by python-can's.  On vcan0 where that is
-up, otherwise over multicast.
+*Sent* are the torques of lab.toml's nine robots through envelope, host and bus; the comparison is a plain loop that sends the
+same frames with python-can's `bus.send(can.Message(…))`.  *Received* are bursts of frames, by our bus and by python-can's.  The
+bus is vcan0 if that is up, otherwise multicast.
 """
 
 import argparse
@@ -34,20 +34,22 @@ from echelon.sim.parts.loading import load
 from echelon.sim.processes.supervisor import Supervisor
 
 CYCLES: Final = 500
-"""Of nine frames each."""
+"""Torque periods that are sent, with nine frames each"""
 BURST: Final = 100
-"""Frames that every receive buffer holds."""
+"""Frames of a burst; every receive buffer can hold them"""
 BRING_UP: Final = 50
+"""Periods after which all drives are enabled"""
 NEVER_NS: Final = 1 << 62
 
 
 def lab(*overrides: str) -> tuple[Any, Plan]:
-    """Returns lab.toml with a closed torque path."""
+    """Returns scenario and plan of lab.toml with a closed torque path; `overrides` are as for `--set`."""
     return load(shipped()["lab"], ["can.path=closed", "claims=[]", *overrides])
 
 
 class Robots:
-    """The bridge's side of lab.toml's robots, with drives enabled, which then are silent for ever."""
+    """The bridge's side of lab.toml's robots, with enabled drives.  After the bring-up the drives send nothing, and the hosts
+    do not wait for them."""
 
     def __init__(self) -> None:
         plan = lab()[1]
@@ -70,7 +72,7 @@ class Robots:
             raise RuntimeError("drives are not enabled")
 
     def torques(self, cycles: int) -> list[tuple[int, list[Message]]]:
-        """Returns what robots say in the next cycles."""
+        """Returns the torque messages of all robots in the next cycles: for each cycle its instant [ns] and the messages."""
         said = []
         for cycle in range(self.cycle, self.cycle + cycles):
             time_ns = cycle * self.period_ns
@@ -83,7 +85,7 @@ class Robots:
         return said
 
     def send(self, bus: Bus, cycles: int) -> tuple[float, list[Frame]]:
-        """Sends so many cycles; returns frames per second, and the frames."""
+        """Sends the torques of `cycles` cycles on a bus; returns frames per second, and the frames."""
         said, sent = self.torques(cycles), list[Frame]()
         begun_s = time.perf_counter()
         for time_ns, messages in said:
@@ -98,7 +100,7 @@ class Robots:
 
 
 def plain_bus(url: str) -> can.BusABC:
-    """Opens the same bus with python-can alone."""
+    """Returns the bus at a URL, opened with python-can alone."""
     interface, _, rest = url.partition(":")
     if interface == "socketcan":
         return can.Bus(interface=interface, channel=rest, ignore_config=True)
@@ -115,7 +117,7 @@ def plain_send(bus: can.BusABC, frames: list[Frame]) -> float:
 
 
 def receive(take: Callable[[], Any], sender: Bus, frames: list[Frame]) -> float:
-    """Sends frames in bursts and takes each burst; returns frames per second of taking alone."""
+    """Sends frames in bursts and receives each burst by `take`; returns frames per second of the receiving alone."""
     took_s = 0.0
     for at in range(0, len(frames), BURST):
         burst = frames[at : at + BURST]
@@ -130,7 +132,7 @@ def receive(take: Callable[[], Any], sender: Bus, frames: list[Frame]) -> float:
 
 
 def bus_rates(url: str, cycles: int = CYCLES) -> dict[str, float]:
-    """Returns frames per second of all ways over a bus, one after the other."""
+    """Returns frames per second of all ways to send and to receive on a bus, measured one after the other."""
     robots = Robots()
     with open_bus(url) as bus:
         bridge, frames = robots.send(bus, cycles)
@@ -152,7 +154,7 @@ def bus_rates(url: str, cycles: int = CYCLES) -> dict[str, float]:
 
 
 def closed_in_process(seconds: float) -> float:
-    """Runs lab.toml with a closed torque path in this process, without a bus; returns how many times real time."""
+    """Runs lab.toml with a closed torque path in this process, without a bus; returns run time over wall time."""
     engine = Engine(lab(f"duration={seconds}")[1])
     begun_s = time.perf_counter()
     engine.run()
@@ -160,7 +162,7 @@ def closed_in_process(seconds: float) -> float:
 
 
 def closed_processes(url: str, seconds: float) -> float:
-    """Runs lab.toml with a closed torque path as processes, with everything on; returns ticks per second."""
+    """Runs lab.toml with a closed torque path as processes, with recording and buses; returns ticks per second."""
     scenario, plan = lab(f"duration={seconds}")
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         outcome = Supervisor(
@@ -178,7 +180,7 @@ def closed_processes(url: str, seconds: float) -> float:
 
 
 def measure(repeats: int, seconds: float) -> list[Row]:
-    """Measures everything, in turn."""
+    """Measures everything `repeats` times, each kind in turn; `seconds` is the duration of the runs."""
     url = resolve_url("auto")
     where = url.split(":")[0].replace("socketcan", "vcan0").replace("udp_multicast", "multicast")
     rates: list[dict[str, float]] = []
@@ -208,7 +210,7 @@ def measure(repeats: int, seconds: float) -> list[Row]:
 
 
 def main() -> int:
-    """Measures and prints."""
+    """Measures and prints; returns the exit code, 0."""
     parser = argparse.ArgumentParser(prog="python -m bench.can", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--repeat", type=int, default=5, help="how often (default 5)")
     parser.add_argument("--seconds", type=float, default=3.0, help="run time of lab.toml (default 3)")

@@ -1,7 +1,8 @@
-"""Compare ways to run a lockstep of 13 processes: `python -m bench.lockstep [--ticks N] [--repeat R] [--peers a,b]`.
+"""Compares ways to run a lockstep of 13 processes: `python -m bench.lockstep [--ticks N] [--repeat R] [--peers a,b]`.
 
-The peers take turns, so that all meet the same machine. Rates are medians over the repeats; processor time and context
-switches are those of all processes of a peer. A peer whose final values differ from the others' has cheated or failed.
+A *peer* is one way: Zenoh as this project uses it, or another library.  The peers are measured in turn, so that the load of the
+machine is the same for all.  Rates are medians over the repeats; processor time and context switches are sums over all
+processes of a peer.  A peer whose final values are not the expected ones has failed.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ PEERS: Final = {
     "mosaik": ("bench.peers.mosaik_processes", "run", "mosaik"),
 }
 SLOW: Final = {"helics": 5, "mosaik": 5}
-"""These run that many times fewer ticks."""
+"""Slow peers run this many times fewer ticks"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +46,11 @@ class Measurement:
     cpu_ms_per_tick: float
     switches_per_tick: float
     values: tuple[float, ...]
-    """The last value of every role, in the order of `ROLES`."""
+    """The final value of every role, in the order of `ROLES`"""
 
 
 def measure(run: Callable[[int, Path], None], ticks: int) -> Measurement:
-    """Run a peer once."""
+    """Returns the measurement of one run of a peer; `run` takes the number of ticks and a folder for its results."""
     folder = Path(tempfile.mkdtemp(prefix="lockstep-"))
     try:
         run(ticks, folder)
@@ -68,7 +69,7 @@ def measure(run: Callable[[int, Path], None], ticks: int) -> Measurement:
 
 
 def expected(ticks: int) -> tuple[float, ...]:
-    """Return the final values, computed in this process."""
+    """Returns the final values of all roles, computed in this process."""
     from bench.tree import COORDINATOR, LEADERS, command_law, robot_law, robot_start, sum_law
 
     values = {role: robot_start(role) for role in ROLES}
@@ -84,7 +85,7 @@ def expected(ticks: int) -> tuple[float, ...]:
 
 
 def machine() -> dict[str, str | int]:
-    """Describe where this ran."""
+    """Returns facts about the machine and the versions of packages."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     found: dict[str, str | int] = {
@@ -103,12 +104,12 @@ def machine() -> dict[str, str | int]:
 
 
 def installed(module: str) -> bool:
-    """Say whether everything a peer needs can be imported."""
+    """Returns whether all packages that a peer needs can be imported; `module` is the peer's module."""
     return all(importlib.util.find_spec(name) for name in importlib.import_module(module).REQUIRES)
 
 
 def compare(names: list[str], ticks: int, repeat: int) -> tuple[dict[str, list[Measurement]], dict[str, str]]:
-    """Measure peers in turn, `repeat` times; return their measurements, and why there are none where there are none."""
+    """Measures peers in turn, `repeat` times; returns their measurements, and for peers without measurements the reason."""
     runs: dict[str, list[Measurement]] = {name: [] for name in names}
     failures: dict[str, str] = {}
     for number in range(repeat):
@@ -137,7 +138,7 @@ def compare(names: list[str], ticks: int, repeat: int) -> tuple[dict[str, list[M
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measures and prints; returns the exit code: 1 if a peer failed, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m bench.lockstep", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--ticks", type=int, default=2000, help="ticks of a run; slow peers run a fifth (default 2000)")
     parser.add_argument("--repeat", type=int, default=5, help="runs of each peer (default 5)")
@@ -159,7 +160,7 @@ def main() -> int:
 
 
 def table(runs: dict[str, list[Measurement]], failures: dict[str, str]) -> str:
-    """Lay out medians, and ratios to the first peer."""
+    """Returns a table with the medians of all peers, and the ratios of their rates to Zenoh's."""
     heads = ("ticks/s", "min", "max", "of zenoh", "cpu ms/tick", "switches/tick")
     lines = ["{:12} {:>8} {:>7} {:>7} {:>9} {:>12} {:>14}".format("peer", *heads)]
     base = statistics.median(one.ticks_per_s for one in runs["zenoh"]) if runs.get("zenoh") else None

@@ -1,4 +1,4 @@
-"""What whole runs cost: the paper's scenario as processes with everything on, the lab's in one process, start-up, memory."""
+"""Speed, start-up time and memory of whole runs: paper.toml as processes, lab.toml in one process."""
 
 import statistics
 import tempfile
@@ -19,7 +19,7 @@ from echelon.sim.view.live import Display
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table: what was measured, its unit, and each repeat's value."""
+    """A row of the table: what was measured, its unit, and the value of each repeat."""
 
     what: str
     unit: str
@@ -27,12 +27,13 @@ class Row:
 
     @property
     def median(self) -> float:
-        """The value to quote."""
+        """The median of the repeats."""
         return statistics.median(self.values)
 
 
 def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float, float, float]:
-    """Runs `seconds` of paper.toml as processes; returns ticks/s, start-up [s], most memory of a robot process [MB]."""
+    """Runs `seconds` of paper.toml as processes; returns ticks per second, start-up time [s], and the largest memory of a
+    robot's process [MB]."""
     scenario, plan = load(shipped()["paper"], [f"duration={seconds}"])
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         outcome = Supervisor(
@@ -53,9 +54,9 @@ def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float
 
 
 def lab_in_process(*, whole: bool) -> float:
-    """Runs lab.toml in this process; returns how many times faster than real time.
+    """Runs lab.toml in this process; returns run time over wall time.
 
-    `whole`: with recording and frames on a virtual bus; otherwise roles and links alone."""
+    `whole`: with recording and frames on a virtual bus; otherwise only roles and links."""
     scenario, plan = load(shipped()["lab"])
     if whole:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
@@ -77,7 +78,7 @@ def lab_in_process(*, whole: bool) -> float:
 
 
 def measure(repeats: int, seconds: float) -> list[Row]:
-    """Measures everything, the kinds of run in turn."""
+    """Measures everything `repeats` times, each kind of run in turn; `seconds` is the run time of paper.toml."""
     full, bare, startups, memories, alone, whole = [], [], [], [], [], []
     for _ in range(repeats):
         rate, startup, memory = paper_processes(seconds, recorded=True, can=True)
@@ -98,7 +99,7 @@ def measure(repeats: int, seconds: float) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """Lays out medians, smallest and largest."""
+    """Returns the rows as a table with median, smallest and largest value."""
     lines = [f"{'':52} {'median':>9} {'min':>9} {'max':>9}"]
     lines += [
         f"{f'{row.what} [{row.unit}]':52.64} {row.median:9.4g} {min(row.values):9.4g} {max(row.values):9.4g}"

@@ -1,8 +1,8 @@
-"""The exchange every peer performs: nine robots, three leaders, one coordinator, a process each, in lockstep.
+"""The exchange of messages that every peer performs: nine robots, three leaders, one coordinator, each a process, in lockstep.
 
-A tick: robots send their state to their leader, leaders their group's state to the coordinator; the coordinator sends
-one reference to the leaders, each leader one command to its robots. That is 16 messages and 24 deliveries. What is sent
-depends on all that was received, so the final values show that nobody left anything out.
+In a tick the robots send their states to their leaders, the leaders their groups' states to the coordinator; then the
+coordinator sends a reference to the leaders, and each leader a command to its robots.  These are 16 messages and 24 deliveries.
+Each message depends on all messages that its sender received, so a missing message changes the final values.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from typing import Final, Protocol
 
 GROUPS: Final = 3
 ROBOTS: Final = 3
-"""Robots in each group."""
+"""Robots in each group"""
 HEADER: Final = struct.Struct("<HHIQq")
-"""Schema version, channel, source, sequence, time [ns]."""
+"""Schema version, channel, source, sequence number, time [ns]"""
 CHANNELS: Final = ("state", "group", "reference", "command")
 FIELDS: Final = {"state": 10, "group": 30, "reference": 60, "command": 24}
-"""Number of float64 in a message of each channel."""
+"""Number of float64 values in a message of each channel"""
 _BODY: Final = {channel: struct.Struct(f"<{number}d") for channel, number in FIELDS.items()}
 _DOUBLE: Final = struct.Struct("<d")
 START_TIMEOUT_S: Final = 30.0
@@ -54,7 +54,7 @@ class Role:
 
     @property
     def source(self) -> int:
-        """A number of its own for the header."""
+        """The role's number in headers."""
         if self.group is None:
             return 200
         return 100 + self.group if self.number is None else self.group * ROBOTS + self.number
@@ -70,28 +70,29 @@ ROLES: Final = (
 
 
 Play = Generator[str, Sequence[bytes], float]
-"""A role at work: it yields the channel it waits for, is sent this tick's message of each sender, returns its last value."""
+"""A role that runs: a generator that yields the channel it waits for, receives by `send` this tick's message of each sender,
+and returns its final value"""
 
 
 class Ports(Protocol):
-    """How a role reaches the others: all that differs between the peers."""
+    """How a role sends and receives; only this differs between the peers."""
 
     def send(self, channel: str, payload: bytes) -> None:
-        """Send to every receiver of the channel."""
+        """Sends a message to every receiver of the channel."""
 
     def drive(self, play: Play) -> float:
-        """Run a role to its end."""
+        """Runs a role to its end; returns its final value."""
 
 
 class BlockingPorts:
     """Ports whose `receive` waits for this tick's message from each sender of a channel."""
 
     def receive(self, channel: str) -> Sequence[bytes]:
-        """Wait for this tick's message from each sender of the channel."""
+        """Waits for this tick's message from each sender of the channel, and returns them."""
         raise NotImplementedError
 
     def drive(self, play: Play) -> float:
-        """Run a role to its end."""
+        """Runs a role to its end; returns its final value."""
         try:
             channel = next(play)
             while True:
@@ -102,13 +103,13 @@ class BlockingPorts:
 
 
 def pack(channel: str, source: int, tick: int, value: float) -> bytes:
-    """Return a message whose fields are all `value`."""
+    """Returns a message whose fields are all `value`."""
     head = HEADER.pack(1, CHANNELS.index(channel), source, tick, tick * 10_000_000)
     return head + _BODY[channel].pack(*[value] * FIELDS[channel])
 
 
 def unpack(payload: bytes, tick: int) -> float:
-    """Return the value of a message of this tick, read from its first and last field."""
+    """Returns the value in a message: the mean of its first and last field.  Raises ValueError if it is not of this tick."""
     if HEADER.unpack_from(payload)[3] != tick:
         raise ValueError(f"a message of tick {HEADER.unpack_from(payload)[3]} came in tick {tick}")
     first: float = _DOUBLE.unpack_from(payload, HEADER.size)[0]
@@ -117,27 +118,27 @@ def unpack(payload: bytes, tick: int) -> float:
 
 
 def robot_start(role: Role) -> float:
-    """Return a robot's first state."""
+    """Returns the state of a robot at the start."""
     return 1.0 + role.source
 
 
 def robot_law(state: float, command: float) -> float:
-    """Return the next state."""
+    """Returns the next state of a robot."""
     return 0.5 * state + command
 
 
 def sum_law(values: Sequence[float]) -> float:
-    """Return what a leader or the coordinator makes of its children's values, whatever their order."""
+    """Returns the sum of children's values for a leader or the coordinator; it does not depend on their order."""
     return sum(sorted(values))
 
 
 def command_law(reference: float, group: int) -> float:
-    """Return a leader's command."""
+    """Returns the command of a leader."""
     return 0.001 * reference + group
 
 
 def play(role: Role, send: Callable[[str, bytes], None], ticks: int) -> Play:
-    """Run a role for a number of ticks."""
+    """Runs a role for `ticks` ticks; `send` takes channel and message."""
     source = role.source
     value = robot_start(role)
     for tick in range(ticks):
@@ -156,17 +157,18 @@ def play(role: Role, send: Callable[[str, bytes], None], ticks: int) -> Play:
 
 
 class Meter:
-    """What a process used between `start` and `report`."""
+    """Measures what a process uses between `start` and `report`."""
 
     def start(self) -> None:
-        """Begin."""
+        """Begins to measure."""
         gc.collect()
         gc.freeze()
         self._before = resource.getrusage(resource.RUSAGE_SELF)
         self._start = time.monotonic()
 
     def report(self, folder: Path, name: str, value: float | None) -> None:
-        """Write what was used since `start` to `folder`; processes that only serve have no value."""
+        """Writes what was used since `start` into a file of the folder, with the final value of a role, if the process has
+        one."""
         end, after, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF), self._before
         found = {
             "value": value,
@@ -179,18 +181,19 @@ class Meter:
 
 
 def die_with_parent() -> None:
-    """Let the kernel end this process when the one that started it ends."""
+    """Makes the kernel end this process when its parent process ends."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     if os.getppid() == 1:
         os._exit(1)
 
 
 Connect = Callable[[Role, Path], "Iterator[Ports]"]
-"""Yields a role's ports when they are ready for the first message; resumed after the last."""
+"""A generator function that yields the ports of a role when they are ready for the first message, and is resumed after the
+last"""
 
 
 def run_roles(connect: Connect, ticks: int, folder: Path) -> None:
-    """Run every role in a forked process, meeting before the first tick and after the last."""
+    """Runs every role in a forked process; the processes wait for each other before the first tick and after the last."""
     context = multiprocessing.get_context("fork")
     barrier = context.Barrier(len(ROLES))
     children = [
@@ -200,7 +203,8 @@ def run_roles(connect: Connect, ticks: int, folder: Path) -> None:
 
 
 def run_processes(children: Sequence[multiprocessing.process.BaseProcess]) -> None:
-    """Start processes and wait for all; when one fails, end the others."""
+    """Starts processes and waits until all have ended.  Raises RuntimeError if one fails or takes too long; then all are
+    ended."""
     try:
         for child in children:
             child.start()

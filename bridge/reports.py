@@ -38,9 +38,13 @@ class BusEvent:
     """An event at a node of a bus, for example `bus-off`; `who` names the node."""
 
     time: float
+    """When it happened [s]"""
     node: int
+    """Number of the node on its bus"""
     who: str
+    """Name of the node: `bridge`, or that of a drive: its robot, and the wheel if each wheel has a drive of its own"""
     event: str
+    """What happened, for example `bus-off`"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +52,17 @@ class BusReport:
     """One bus."""
 
     name: str
+    """Name of the bus in the scenario"""
     bitrate: int
+    """[bit/s]"""
     load: float
     """Share of the time that the frames took, or would take on a real bus: 1 is a full bus"""
     lost: int = 0
+    """Frames that were lost: a queue was full, or its node was bus-off"""
     destroyed: int = 0
+    """Attempts to send that an error destroyed; the frame is sent again"""
     events: tuple[BusEvent, ...] = ()
+    """The first events, in order of time"""
     identifiers: Mapping[str, IdentifierReport] = field(default_factory=dict)
     """By identifier, three hexadecimal digits"""
 
@@ -77,9 +86,11 @@ class ScheduledEvent:
     """An event of the scenario, in words."""
 
     time: float
+    """When it begins [s]"""
     until: float | None
-    """None: it lasts to the end of the run"""
+    """When it ends [s]; None: it lasts to the end of the run"""
     what: str
+    """What happens, in words"""
     whom: tuple[str, ...]
     """Names of the robots or buses that it concerns"""
 
@@ -89,6 +100,7 @@ class WheelsReport:
     """The commands to one robot's wheels."""
 
     protocol: str
+    """Protocol of its drives"""
     commands: int
     """Periods in which torques were sent"""
     stopped: Mapping[str, int]
@@ -130,6 +142,7 @@ class DrivesReport:
     """All virtual drives of a run."""
 
     robots: Mapping[str, DriveReport]
+    """By name of the robot"""
     refused: Mapping[str, int]
     """Messages of other processes that the drives refused, by reason"""
     foreign: int = 0
@@ -152,9 +165,13 @@ class TorqueTimes:
     in_time: int
     """Number of torques with a latency of less than a torque period"""
     latency_median: float | None
+    """[s]; None, here and below, if no torque came"""
     latency_p99: float | None
+    """99th percentile [s]"""
     latency_max: float | None
+    """Largest [s]"""
     lost_on_links: int
+    """Torques that were lost on their links"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,11 +179,15 @@ class FindingReport:
     """A finding of the referee: something on a bus that breaks the plan or the protocol."""
 
     time: float
+    """When it was found [s]"""
     bus: str
+    """Name of the bus"""
     id: str
     """Identifier, three hexadecimal digits"""
     kind: str
+    """Kind of the finding, for example `counter gap`"""
     text: str
+    """The finding in words"""
     robot: str
     """Name of the robot; empty if the finding concerns no single robot"""
 
@@ -176,9 +197,13 @@ class TimingReport:
     """The periods between the frames of one identifier [s]; None if there were too few frames."""
 
     frames: int
+    """Number of frames"""
     period_mean: float | None = None
+    """Mean period [s]"""
     period_min: float | None = None
+    """Shortest period [s]"""
     period_max: float | None = None
+    """Longest period [s]"""
     jitter: float | None = None
     """Standard deviation of the periods"""
 
@@ -188,6 +213,7 @@ class RefereeReport:
     """The referee's report."""
 
     frames: int
+    """Frames that were judged"""
     unknown: int
     """Frames with identifiers that no robot of the plan uses"""
     kinds: Mapping[str, int]
@@ -199,12 +225,24 @@ class RefereeReport:
     source: str = "can.log"
     """Where the frames came from: `can.log`, or `bus` if the referee listened itself"""
     until: float | None = None
-    """Only frames up to then were judged, for the run was stopped there [s]; None: all frames"""
+    """When the run was stopped, if it was [s]: only frames up to then are judged; None: all frames are"""
+    later: int = 0
+    """Frames in can.log after `until`, which are not judged: the processes of a run end one after the other"""
 
     @property
     def up_to(self) -> str:
-        """Up to when frames were judged, in words that follow their number; empty if all were."""
+        """Up to when frames are judged, in words that follow their number; empty if all are."""
         return "" if self.until is None else f" up to {self.until:g} s, where the run was stopped"
+
+    @property
+    def after_stop(self) -> str:
+        """A sentence about the frames after the stop, without a capital or a full stop; empty if there are none."""
+        if self.until is None or not self.later:
+            return ""
+        return (
+            f"the run was stopped at {self.until:g} s; can.log and the numbers of the buses include {self.later} later frames, "
+            "which are not judged"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +262,7 @@ class CanReport:
     log_start: float
     """Run time at which can.log begins [s]: negative if drives are brought up"""
     frames: int
+    """Frames that were made for the buses"""
     load_mean: float
     """Load of the busiest bus"""
     fit: tuple[str, ...]
@@ -231,7 +270,9 @@ class CanReport:
     advice: tuple[str, ...]
     """Changes that would make the frames fit"""
     buses: tuple[BusReport, ...]
+    """By bus, in the order of the plan"""
     scheduled: tuple[ScheduledEvent, ...]
+    """Events of the scenario"""
     sent: int | None
     """Frames that the buses accepted.  This and the next four fields are None if the run was killed and recovered."""
     failed: int | None
@@ -243,13 +284,17 @@ class CanReport:
     log_error: str | None
     """The last error of writing can.log"""
     robots: Mapping[str, WheelsReport]
+    """By name of the robot"""
     foreign: int = 0
     """Frames that no process of this run had announced"""
     refused: Mapping[str, int] = field(default_factory=dict)
     """Messages of other processes that the bridge refused, by reason"""
     drives: DrivesReport | None = None
+    """The virtual drives; None without any"""
     torque: TorqueTimes | None = None
+    """Latencies of torques; None in virtual time"""
     referee: RefereeReport | None = None
+    """What the referee found; None if nothing was judged"""
     messages: int = 0
     """Messages that the bridge sent to recorders and other listeners"""
 

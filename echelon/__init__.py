@@ -12,6 +12,8 @@ For notebooks and scripts:
     echelon.load("lab")                     a scenario and the plan made from it
     echelon.open_run("runs/demo")           a run from its folder
     echelon.Simulation("lab")               a run step by step
+    echelon.replay("runs/demo", {…})        its messages fed to roles with other values: where their outputs differ
+    echelon.diff("runs/a", "runs/b")        where two runs part
 
 To write parts of your own, derive from `Law`, `Plant`, `Trajectory` or `DriveProtocol` (docs/add-a-law.md,
 docs/add-a-protocol.md).
@@ -27,22 +29,31 @@ if TYPE_CHECKING:
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
-    from echelon.sim.notebook import Loaded, load, open_run, run
+    from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
+    from echelon.sim.replay.comparison import ChannelComparison, Difference
+    from echelon.sim.replay.difference import RunDifference
+    from echelon.sim.replay.replay import Replay
     from echelon.sim.simulation import Simulation
 
 __version__ = "0.1.0"
 __all__ = [
+    "ChannelComparison",
+    "Difference",
     "DriveProtocol",
     "Law",
     "Loaded",
     "Plant",
+    "Replay",
     "Run",
+    "RunDifference",
     "Simulation",
     "Trajectory",
     "UserError",
     "__version__",
+    "diff",
     "load",
     "open_run",
+    "replay",
     "run",
 ]
 
@@ -51,14 +62,26 @@ def __getattr__(name: str) -> Any:
     """Imports a public name when it is first used: most processes and commands need only a few of them."""
     found: dict[str, Any] = {}
     match name:
-        case "Loaded" | "load" | "open_run" | "run":
-            from echelon.sim.notebook import Loaded, load, open_run, run
+        case "Loaded" | "diff" | "load" | "open_run" | "replay" | "run":
+            from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
 
-            found = {"Loaded": Loaded, "load": load, "open_run": open_run, "run": run}
+            found = {"Loaded": Loaded, "diff": diff, "load": load, "open_run": open_run, "replay": replay, "run": run}
         case "Run":
             from echelon.sim.finished_run import Run
 
             found = {"Run": Run}
+        case "ChannelComparison" | "Difference":
+            from echelon.sim.replay.comparison import ChannelComparison, Difference
+
+            found = {"ChannelComparison": ChannelComparison, "Difference": Difference}
+        case "Replay":
+            from echelon.sim.replay.replay import Replay
+
+            found = {"Replay": Replay}
+        case "RunDifference":
+            from echelon.sim.replay.difference import RunDifference
+
+            found = {"RunDifference": RunDifference}
         case "Simulation":
             from echelon.sim.simulation import Simulation
 

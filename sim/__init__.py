@@ -1,1 +1,1 @@
-"""Assembles whole runs: the in-process engine, processes under supervision, recording, summary, report, export."""
+"""Whole runs: in one process or in many, and what they leave: recording, summary, report, tables."""

@@ -1,4 +1,4 @@
-"""Where the buses of a run are: what the scenario says, what --can says, and what this machine has."""
+"""Chooses the URL of each bus of a run: from `--can`, else from the scenario; and checks it against this machine."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,39 +10,45 @@ from echelon.plan.plan import Plan
 
 
 def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:
-    """Returns where each of the plan's buses is, in full; none if there are to be no frames.  Raises UsageError.
+    """Returns the full URL of each bus of the plan, in its order; empty if the run makes no frames.
 
-    `wanted` is what --can says: a URL for all buses, or one for each, with commas between."""
+    `wanted` is the value of `--can`: one URL for all buses, or one for each with commas between; `none`: no frames; None: what
+    the scenario says.  `one_process` says that all roles run in one process.  Raises UsageError if the number of URLs does not
+    fit, two buses have the same URL, a URL is not known, or a network interface is not there."""
     if wanted == "none" or not (plan.can.enabled or wanted):
         return ()
     urls = [bus.url for bus in plan.can.buses]
     if wanted:
         given = wanted.split(",")
         if len(given) not in (1, len(urls)):
-            raise UsageError(f"--can {wanted}: {len(given)} of them for {len(urls)} buses")
+            names = ", ".join(bus.name for bus in plan.can.buses)
+            raise UsageError(f"--can {wanted}: must be one URL, or one for each bus ({names}) with commas between")
         urls = given * len(urls) if len(given) == 1 else given
-    if one_process:  # it needs no bus to others; name one to be heard
+    if one_process:  # it needs no bus that others can use, unless `wanted` or the scenario names one
         urls = [f"virtual:{bus.name}" if url == "auto" else url for url, bus in zip(urls, plan.can.buses, strict=True)]
     resolved = tuple(_checked_bus(url, number) for number, url in enumerate(urls))
     if len(set(resolved)) < len(resolved):
-        raise UsageError(f"--can {wanted or ','.join(urls)}: {len(resolved)} buses need as many places")
+        raise UsageError(f"--can {wanted or ','.join(urls)}: two buses have the same URL")
     return resolved
 
 
 def check_wall_clock(plan: Plan, urls: Sequence[str]) -> None:
-    """Raises UsageError for what cannot be on a wall clock, with the buses at these places."""
+    """Raises UsageError if the plan cannot run on a wall clock on buses with these URLs."""
     disturbed = sorted({event.kind for event in plan.events} & set(DISTURBANCES))
     if disturbed and not plan.can.paced:
         raise UsageError(
-            f"events of kind {disturbed[0]!r}: on a wall clock a bus takes its own time, and errors as they come"
-            + ("; --set can.timing=bits makes a virtual one as slow as a real one" if plan.can.virtual_drives else "")
+            f"events of kind {disturbed[0]!r}: on a wall clock a bus takes its own time, so its errors cannot be scheduled"
+            + ("; with --set can.timing=bits a virtual bus is as slow as a real one" if plan.can.virtual_drives else "")
         )
     real = [url for url in urls if (Path("/sys/class/net") / url.partition(":")[2] / "device").exists()]
     if plan.can.paced and real:
-        raise UsageError(f"can.timing = 'bits': {real[0]} is a real bus on a wall clock, and takes its own time")
+        raise UsageError(
+            f"can.timing = 'bits': {real[0]} is a real bus, which takes its own time; leave can.timing out"
+        )
 
 
-def _checked_bus(url: str, number: int = 0) -> str:
+def _checked_bus(url: str, number: int) -> str:
+    """Returns the full URL of the bus with this number.  Raises UsageError if it is not known or not on this machine."""
     try:
         resolved = resolve_url(url, number)
     except ValueError as error:

@@ -1,6 +1,7 @@
-"""The tables of a run (results.tables) as files: CSV, or Parquet where pyarrow is installed."""
+"""Writes the tables of a run (`Run.tables`) into files: CSV, or Parquet where pyarrow is installed."""
 
 import csv
+import os
 from pathlib import Path
 
 from echelon.errors import UsageError
@@ -9,10 +10,17 @@ from echelon.sim.finished_run import Run
 from echelon.sim.results.tables import Table
 
 
-def export_csv(run: Run, folder: Path) -> list[Path]:
-    """Writes each table of a run as CSV into a folder, which is made if need be; returns the files.
+def in_the_way(run: Run, folder: Path, kind: str) -> list[str]:
+    """Returns the names in a folder that an export of a run as `kind` (csv or parquet) would overwrite."""
+    names = (f"{name}.{kind}" for name in run.tables)
+    return [name for name in names if os.path.lexists(folder / name)]
 
-    Numbers stand in full: a float reads back as the same float.  One header line, times in seconds.  Raises OSError."""
+
+def export_csv(run: Run, folder: Path) -> list[Path]:
+    """Writes each table of a run as a CSV file; returns the files.
+
+    The folder is made if it does not exist; files of the same names are overwritten (`in_the_way`).  Numbers have all their
+    digits: a float reads back as the same float.  There is one header line; times are in seconds.  Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     for name, table in run.tables.items():
@@ -25,10 +33,10 @@ def export_csv(run: Run, folder: Path) -> list[Path]:
 
 
 def export_parquet(run: Run, folder: Path) -> list[Path]:
-    """Writes each table of a run as Parquet into a folder, which is made if need be; returns the files.
+    """Writes each table of a run as a Parquet file; returns the files.
 
-    The unit of a column is in its metadata.  Raises UsageError without pyarrow, which this package does not install by itself,
-    and OSError."""
+    The folder is made if it does not exist; files of the same names are overwritten (`in_the_way`).  The unit of a column is in
+    its metadata.  Raises UsageError without pyarrow, which this package does not install, and OSError."""
     try:
         from pyarrow import parquet
     except ImportError:

@@ -1,4 +1,4 @@
-"""A finished run for people who compute: its summary, and its states and errors as numpy arrays with named fields."""
+"""A finished run as a Python object: its summary, and its states and errors as numpy arrays with named fields."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -37,9 +37,9 @@ Records = NDArray[np.void]
 
 @dataclass(frozen=True)
 class DataFrames:
-    """The tables of a run as pandas data frames, each made when it is first asked for.
+    """The tables of a run as pandas data frames; each is made when it is first used.
 
-    Raises KeyError for one that this run does not have (`Run.tables`)."""
+    An attribute raises KeyError if the run does not have this table (see `Run.tables`)."""
 
     tables: Mapping[str, Table]
 
@@ -55,12 +55,12 @@ class DataFrames:
 
     @cached_property
     def links(self) -> "DataFrame":
-        """What became of messages, by (source, receiver, channel)."""
+        """Counts and ages of messages on each link, by (source, receiver, channel)."""
         return self.tables["links"].to_pandas()
 
     @cached_property
     def torques(self) -> "DataFrame":
-        """Of a closed torque path: wanted, commanded and reported torques, by (t, robot, wheel)."""
+        """Wanted, commanded and reported torques, by (t, robot, wheel); only with a closed torque path."""
         return self.tables["torques"].to_pandas()
 
     @cached_property
@@ -72,12 +72,12 @@ class DataFrames:
 class Run:
     """A finished run.  The summary's keys are attributes (`run.verdict`, `run.claims`, `run.distance`, `run.trace_digest` …).
 
-        run.robots["g1/r1"]["x"]         position of a robot at every instant of its own [m]
-        run.blocks["inter"]["norm"]      |e| of a block at the instants that all robots share [m]
+        run.robots["g1/r1"]["x"]         x of a robot at each instant at which it sent its state [m]
+        run.blocks["inter"]["norm"]      norm of a block's error at each instant at which all robots sent their states [m]
         run.figure("errors")             a figure of the report
 
-    `robots` and `blocks` hold structured numpy arrays: one record per instant, fields as in `run.units`.  `tables` are what
-    `echelon export` writes.
+    `robots` and `blocks` hold structured numpy arrays, one record per instant; `run.units` has the unit of each field.
+    `tables` are the tables that `echelon export` writes.
     """
 
     units = UNITS
@@ -85,45 +85,45 @@ class Run:
     def __init__(self, trace: Trace, summary: Summary, folder: Path | None = None) -> None:
         self.trace, self.summary, self.folder = trace, summary, folder
         self.report_failure = ""
-        """Why there is no report, if one was to be written and could not be"""
+        """Why the report could not be written; "" if it was, or was not asked for"""
 
     @property
     def plan(self) -> Plan:
-        """What was run, every default filled in."""
+        """The plan of the run."""
         return self.trace.plan
 
     @property
     def holds(self) -> bool:
-        """True if the run claimed something, and all claims and checks passed."""
+        """True if the verdict is HOLDS: the scenario has claims, and all claims and checks passed."""
         return self.summary.verdict.word == "HOLDS"
 
     @property
     def ok(self) -> bool:
-        """True unless a claim or a check failed: the verdict is HOLDS, or HEALTHY because the run claimed nothing."""
+        """True unless the verdict is FAILS: no claim and no check failed."""
         return self.summary.verdict.word != "FAILS"
 
     @property
     def failure(self) -> str | None:
-        """Why the run broke off, None if it did not."""
+        """Why the run broke off; None if it did not."""
         return self.summary.run.failure
 
     @cached_property
     def robots(self) -> "Named[Records]":
-        """By robot, its states: `t`, the fields of a state message (echelon.messages.STATE_FIELDS), and `x_desired` and
-        `y_desired`, where the desired formation has it."""
+        """The states of each robot, by its name: `t`, the fields of a state message (echelon.messages.STATE_FIELDS), and
+        `x_desired` and `y_desired`, its place in the desired formation."""
         return Named("robot", {robot.name: partial(self._states, robot.index) for robot in self.plan.robots})
 
     @cached_property
     def blocks(self) -> "Named[Records]":
-        """By block, its variables: `t`, `value`, `desired`, `error`, `rate`, `error_rate` (a number for each component)
-        and `norm`, which is |error|."""
+        """The variables of each block, by its name: `t`; `value`, `desired`, `error`, `rate`, `error_rate`, each with a number
+        for every component; and `norm`, the norm of the error."""
         series = self._blocks.series
         return Named("block", {one.block.name: partial(_variables, self._blocks, one) for one in series})
 
     @cached_property
     def tables(self) -> "Named[Table]":
-        """By name, the tables of `echelon export`: `robots`, `blocks`, `links`; of a run with a folder also `frames`, if there
-        were any, and `torques`, if the torque path was closed."""
+        """The tables of `echelon export`, by their names: `robots`, `blocks`, `links`; with a can.log in the run's folder also
+        `frames`, and, if the torque path is closed, `torques`."""
         makers: dict[str, Callable[[], Table]] = {
             "robots": lambda: robots_table(self.trace),
             "blocks": lambda: blocks_table(self._blocks),
@@ -167,19 +167,19 @@ class Run:
 
     @property
     def links(self) -> tuple[LinkResult, ...]:
-        """What became of the messages of every link."""
+        """Counts and ages of messages on each link."""
         return self.summary.links
 
     def figure(self, name: str) -> "Picture":
-        """Returns a figure of the report: `trajectories`, `blocks`, `errors`, `distance` or `torques`.  Jupyter shows it;
-        `save(path)` writes it as SVG, PDF or PNG.  Raises KeyError for another name."""
+        """Returns a figure of the report: `trajectories`, `blocks`, `errors`, `distance` or `torques`.  Jupyter shows it; its
+        method `save(path)` writes it as SVG, PDF or PNG.  Raises KeyError for any other name."""
         from echelon.sim.report.figures import picture
 
         return picture(name, self.trace, self._blocks)
 
     def to_pandas(self) -> DataFrames:
         """Returns the run's tables as data frames.  Raises ImportError without pandas, which this package does not install."""
-        import pandas  # noqa: F401  so that it is missed here
+        import pandas  # noqa: F401  raises ImportError here rather than at the first table
 
         return DataFrames(self.tables)
 
@@ -198,7 +198,7 @@ class Run:
 
 
 class Named(Mapping[str, Value], Generic[Value]):
-    """Things by name; each is made when it is first asked for."""
+    """A mapping from names to values.  Each value is made when it is first asked for."""
 
     def __init__(self, kind: str, makers: Mapping[str, Callable[[], Value]]) -> None:
         self._kind, self._makers = kind, makers
@@ -222,6 +222,7 @@ class Named(Mapping[str, Value], Generic[Value]):
 
 
 def _variables(blocks: Blocks, series: BlockSeries) -> Records:
+    """Returns the variables of a block, one record per instant."""
     parts = [(part, "f8", (series.block.size,)) for part in PARTS]
     table = np.empty(len(blocks.times_ns), dtype=[("t", "f8"), *parts, ("norm", "f8")])
     table["t"], table["norm"] = blocks.seconds, series.norm

@@ -1,8 +1,8 @@
-"""Ctrl-C in a run in one process: the run ends between two instants, and all that it has said by then is kept.
+"""Ctrl-C in a run in one process: the run ends between two instants, and everything up to then is recorded.
 
-An exception in the middle of an instant would leave half of it: frames on the bus twice or not at all, states that nobody
-recorded.  So the first Ctrl-C (or SIGTERM) is only noted, and the run looks at the note after each instant; the second raises
-KeyboardInterrupt at once, for a run that does not get to the end of an instant.
+An exception in the middle of an instant would leave it half done: frames could be sent twice or not at all, and states could
+be missing in the recording.  So the first Ctrl-C (or SIGTERM) is only noted, and the run asks for it after each instant.  The
+second raises KeyboardInterrupt at once, in case an instant never ends.
 """
 
 import signal
@@ -18,16 +18,17 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 @dataclass(slots=True)
 class Interruption:
-    """Whether somebody has asked the run to end."""
+    """`asked` becomes True when the user asks the run to end."""
 
     asked: bool = False
 
 
 @contextmanager
 def interruption(at_once: Callable[[], None]) -> Iterator[Interruption]:
-    """Notes interruptions while it is open; `at_once` is called at each, for what must not wait for the end of an instant.
+    """A context in which Ctrl-C and SIGTERM are noted instead of raised.
 
-    In another thread than the main one, where Python hears of no signal, nothing is ever noted."""
+    `at_once` is called at each of them, for work that must not wait for the end of an instant.  Python handles signals only in
+    the main thread, so in other threads nothing is noted."""
     noted = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield noted

@@ -1,4 +1,4 @@
-"""The parts that others wrote, kept in a run's folder: its scenario.toml runs again there, wherever they came from."""
+"""Copies the files of users' parts into a run's folder, so that its scenario.toml can be run again from there."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,28 +11,28 @@ from echelon.sim.results.records import PartResult
 
 @dataclass(frozen=True, slots=True)
 class KeptParts:
-    """What is kept of a scenario's parts."""
+    """The users' parts of a scenario, as a run's folder keeps them."""
 
     names: dict[Source, str]
-    """What each file is called in the folder"""
+    """The name of each file in the folder"""
     results: tuple[PartResult, ...]
     """The parts that are not built in, for the summary"""
 
     @property
     def files(self) -> dict[str, str]:
-        """The texts of the files by their names in the folder."""
+        """The texts of the files, by their names in the folder."""
         return {name: source.text for source, name in self.names.items()}
 
     @property
     def metadata(self) -> dict[str, str]:
-        """The hashes of the files, for the recording."""
+        """The SHA-256 of each file, for the metadata of the recording."""
         return {f"sha256 of {name}": source.sha256 for source, name in self.names.items()}
 
 
 def keep_parts(scenario: Scenario, folder: Path) -> KeptParts:
-    """Copies the files of a scenario's parts into a folder; returns what they are called there.  Raises OSError.
+    """Copies the files of a scenario's parts into a folder; returns their names there.  Raises OSError.
 
-    A file keeps its name unless another part's file, or another file that is there already, has it: nothing is overwritten."""
+    Nothing is overwritten: if another file has the name already, a number is added (`law-2.py`)."""
     names: dict[Source, str] = {}
     results: dict[str, PartResult] = {}
     for part in parts_in(scenario):
@@ -47,7 +47,9 @@ def keep_parts(scenario: Scenario, folder: Path) -> KeptParts:
 
 
 def _copied(source: Source, folder: Path, taken: set[str]) -> str:
-    """Puts a file into a folder; returns what it is called there."""
+    """Copies a file into a folder, unless the same text is there already; returns its name there.
+
+    `taken` are the names of other parts' files."""
     data, path = source.text.encode(), Path(source.name)
     count = 1
     while True:

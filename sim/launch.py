@@ -1,4 +1,7 @@
-"""From a scenario and how it is to be run to a finished run: what the command `echelon run` and `echelon.run` share."""
+"""Launches a run: checks the options, makes the folder, runs the plan, writes the report.
+
+The command `echelon run` and the function `echelon.run` both use it.
+"""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -20,18 +23,24 @@ from echelon.sim.view.live import Display
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Launch:
-    """How a scenario is to be run; see `echelon run --help`.  Raises UsageError for an unknown engine or clock."""
+    """Options of a run, named as in `echelon run --help`.  Raises UsageError for an unknown engine or clock."""
 
     engine: Literal["processes", "inprocess"] = "processes"
     clock: Literal["virtual", "wall"] = "virtual"
     out: Path | None = None
+    """Folder of the run; None: a new one in `runs/`"""
     can: str | None = None
+    """URLs of the buses, with commas between; `none`: no frames; None: what the scenario says"""
     report: bool = True
+    """Write report.html"""
     quiet: bool = False
+    """Show no progress"""
     stall_timeout_s: float = 30.0
+    """A run in virtual time that makes no progress for this time is given up [s]"""
     keep_going: bool = False
+    """Go on when a robot's state is not finite"""
     replace: bool = False
-    """Delete the run of another scenario that `out` holds"""
+    """Delete the run of another scenario that is in `out`"""
 
     def __post_init__(self) -> None:
         for name, value, allowed in (
@@ -43,9 +52,10 @@ class Launch:
 
 
 def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
-    """Runs a scenario, writes its folder, and says on standard error how it stands.
+    """Runs a scenario and writes its folder; shows progress on standard error.
 
-    Raises UserError for options that do not go together, and OSError if a file of the run cannot be written."""
+    `plan` is the plan of `scenario`.  A run that breaks off is returned, too, with the reason as its `failure`.  Raises
+    UserError for options that contradict each other, and OSError if a file of the run cannot be written."""
     if options.engine == "processes":
         warm_up()
     urls = bus_urls(plan, options.can, options.engine == "inprocess")
@@ -62,11 +72,12 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
 
 
 def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, urls: tuple[str, ...]) -> Run:
+    """Runs a scenario in a folder that is made and locked.  Raises OSError."""
     display = Display(plan, quiet=options.quiet)
     if not options.quiet:
         display.say(_heading(plan, options, folder.path, urls))
     if folder.stays:
-        display.say(f"{folder.path}: not of this run, and left as it is: {some(folder.stays)}")
+        display.say(f"{folder.path}: holds files of other runs, which stay: {some(folder.stays)}")
     try:
         summary, trace = execute(
             scenario,
@@ -80,37 +91,40 @@ def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, 
             keep_going=options.keep_going,
         )
     except OSError as error:
-        if error.filename is None:  # of a write to a file that was open
+        if error.filename is None:  # a write to an open file failed
             error.filename = str(folder.path)
         raise
     finally:
         display.close()
     run = Run(trace, summary, folder.path)
     if options.report:
-        from echelon.sim.run_folder import report_on  # matplotlib, when it is needed
+        from echelon.sim.run_folder import report_on  # imported here because it imports matplotlib, which takes long
 
         try:
             report_on([folder.path], folder.path / REPORT)
-        except (UserError, OSError) as error:  # of a run that broke off there may be nothing to report
+        except (UserError, OSError) as error:  # a run that broke off early may have no states
             run.report_failure = f"no report: {error}"
     return run
 
 
 def _check(plan: Plan, options: Launch, urls: Sequence[str]) -> None:
-    """Raises UsageError for options that do not go together."""
+    """Raises UsageError for options that contradict each other or the plan."""
     if options.clock == "wall":
         if plan.can.closed and (not urls or options.engine == "inprocess"):
-            raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes and a bus")
+            raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes, and a bus")
         check_wall_clock(plan, urls)
     if plan.can.closed and options.engine == "processes" and not urls:
-        raise UsageError("--can none: the closed torque path of several processes needs a bus; or --engine inprocess")
+        raise UsageError("--can none: the closed torque path needs a bus, unless --engine inprocess is given")
     if plan.can.closed and options.engine == "processes" and any(url.startswith("virtual") for url in urls):
-        raise UsageError("--can virtual: is inside one process; the closed torque path of several needs another bus")
+        raise UsageError(
+            "--can virtual: is a bus inside one process; the closed torque path needs one between processes"
+        )
     if options.clock == "virtual" and not plan.can.virtual_drives:
         raise UsageError("can.virtual_drives = false: real drives need --clock wall")
 
 
 def _heading(plan: Plan, options: Launch, folder: Path, urls: Sequence[str]) -> str:
+    """Returns the line that is shown when a run begins."""
     robots, nodes = len(plan.robots), len(plan.nodes)
     how = "in one process" if options.engine == "inprocess" else f"as {robots + nodes} processes over Zenoh"
     bus = f", frames on {', '.join(urls)}" if urls else ""

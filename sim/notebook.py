@@ -1,8 +1,8 @@
-"""What a notebook or a script calls: the commands of `echelon` as functions, with the same words."""
+"""Functions for notebooks and scripts: `load`, `run` and `open_run`, with the same names of options as the command line."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import tomlkit
 
@@ -10,28 +10,34 @@ from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
-from echelon.shipped import scenario_path
+from echelon.shipped import EFFECTIVE, scenario_path
 from echelon.sim import run_folder
 from echelon.sim.finished_run import Run
 from echelon.sim.launch import Launch, launch
 from echelon.sim.parts import loading as parts
 
+if TYPE_CHECKING:
+    from echelon.sim.replay.difference import RunDifference
+    from echelon.sim.replay.replay import Replay
+
 
 class Loaded(NamedTuple):
-    """A scenario with every default filled in, and the plan that roles are made from."""
+    """A scenario with all its defaults, and its plan."""
 
     scenario: Scenario
     plan: Plan
 
 
 AnyScenario = str | Path | Mapping[str, Any] | Loaded
-"""The name of a shipped scenario, a TOML file, a run's folder, a table as a dictionary, or what `load` returned"""
+"""A scenario: the name of a shipped one, the path of a TOML file or of a run's folder, a dictionary with the tables, or the
+result of `load`"""
 
 
 def load(scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> Loaded:
-    """Loads a scenario, with some of its values changed: `load("lab", {"law.lead": 0.0, "links.0.delay": 0.05})`.
+    """Loads a scenario and changes some of its values: `load("lab", {"law.lead": 0.0, "links.0.delay": 0.05})`.
 
-    Raises UserError for a scenario, a key or a value that is wrong; the text says what is allowed."""
+    `changes` has values by keys, as `--set` takes them.  Raises UserError for a wrong scenario, key or value; the text says
+    what is allowed."""
     overrides = [f"{key}={toml_value(value)}" for key, value in (changes or {}).items()]
     if isinstance(scenario, Loaded):
         if not overrides:
@@ -55,12 +61,21 @@ def run(
     quiet: bool = False,
     keep_going: bool = False,
 ) -> Run:
-    """Runs a scenario and returns what it showed; `run("lab", {"law.lead": 0.0}, engine="inprocess")`.
+    """Runs a scenario and returns the finished run: `run("lab", {"law.lead": 0.0}, engine="inprocess")`.
 
-    Like `echelon run`, it leaves a folder (`out`, by default `runs/<scenario>-<utc time>`), and says on standard error how it
-    stands, unless `quiet`.  It stops where a robot's state is first not finite, unless it is to `keep_going`.  A run that
-    broke off, or whose verdict fails, is returned too: see `failure` and `verdict`.  If `out` holds the run of another
-    scenario, `replace` deletes that.  Raises UserError for what cannot be run."""
+    `scenario` and `changes` are those of `load`; the other options are those of `echelon run`:
+
+    engine      `processes`: every role its own process; `inprocess`: all roles in this process
+    clock       `virtual`: as fast as messages come; `wall`: in real time
+    out         folder of the run; None: a new one, `runs/<scenario>-<utc time>`
+    can         URLs of the CAN buses, with commas between; None: what the scenario says
+    replace     delete the run of another scenario that is in `out`
+    report      write report.html
+    quiet       show no progress on standard error
+    keep_going  go on when a robot's state is not finite, instead of stopping there
+
+    A run that broke off, or whose verdict is FAILS, is returned as well: see its `failure` and `verdict`.  Raises UserError for
+    a wrong scenario and for options that contradict each other, and OSError if a file cannot be written."""
     loaded = load(scenario, changes)
     options = Launch(
         engine=engine,
@@ -76,12 +91,54 @@ def run(
 
 
 def open_run(folder: str | Path) -> Run:
-    """Opens the folder that a run left.  Raises UserError if it is none, or cannot be read."""
+    """Returns the run in a folder.  Raises UserError if it is not the folder of a run, or a file of it cannot be read."""
     return run_folder.open_run(Path(folder))
 
 
+def replay(
+    run: str | Path | Run,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    scenario: AnyScenario | None = None,
+    only: str | Sequence[str] = (),
+    tolerance: float = 0.0,
+) -> "Replay":
+    """Feeds the messages that a run recorded to today's roles, and compares what they say with what was recorded:
+    `replay("runs/demo", {"law.epsilon": [0.05, 0.1]}, only="coordinator").first_difference`.
+
+    `run` is the folder of a run, or a run that has one.  The roles are those of its own scenario with `changes`, or of
+    another `scenario` of the same tree.  `only` names robots, nodes or groups.  Values that differ by `tolerance` at most are
+    equal.  Raises UserError for what cannot be replayed."""
+    from echelon.sim.recorded_runs import open_recorded
+    from echelon.sim.recorded_runs import replay as replay_recorded
+
+    folder = _folder(run)
+    recorded = open_recorded(folder)
+    plan = load(folder / EFFECTIVE if scenario is None else scenario, changes).plan
+    return replay_recorded(recorded, plan, folder, [only] if isinstance(only, str) else only, tolerance)
+
+
+def diff(first: str | Path | Run, second: str | Path | Run, *, tolerance: float = 0.0) -> "RunDifference":
+    """Says where two runs part: `diff("runs/demo", "runs/again").first_difference` is the first instant, message and value.
+
+    Takes folders of runs, or runs that have one.  Values that differ by `tolerance` at most are equal.  Raises UserError for
+    what cannot be read."""
+    from echelon.sim.recorded_runs import diff_runs
+
+    return diff_runs(_folder(first), _folder(second), tolerance)
+
+
+def _folder(run: str | Path | Run) -> Path:
+    """Returns the folder of a run.  Raises UserError if it has none."""
+    if not isinstance(run, Run):
+        return Path(run)
+    if run.folder is None:
+        raise UserError("this run has no folder, so its messages were not recorded")
+    return run.folder
+
+
 def toml_value(value: Any) -> str:
-    """Returns a Python value as TOML writes it.  Raises UserError for one that TOML does not have."""
+    """Returns a Python or numpy value as TOML text.  Raises UserError for a value that has no TOML type."""
     if hasattr(value, "tolist"):  # numpy
         value = value.tolist()
     if isinstance(value, bool):
@@ -98,4 +155,4 @@ def toml_value(value: Any) -> str:
             + ", ".join(f"{tomlkit.key(str(key)).as_string()} = {toml_value(item)}" for key, item in value.items())
             + "}"
         )
-    raise UserError(f"{value!r} has no place in a scenario: numbers, strings, booleans, lists and dictionaries do")
+    raise UserError(f"{value!r}: must be a number, a string, a boolean, a list or a dictionary to be set in a scenario")

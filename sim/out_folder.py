@@ -1,8 +1,13 @@
-"""The folder that a run writes into: nothing in it is overwritten or deleted but what an earlier run left.
+"""The folder that a run writes into.  Only files that an earlier run wrote are ever overwritten or deleted there.
 
-A run notes in `.echelon.json` which files it writes.  Those go when the next run of the same scenario takes the folder.  Of
-files that people edit the note holds the SHA-256, so that an edited one is not taken for the run's.  The folder is locked
-while a run writes into it.
+A run notes in `.echelon.json` which files it writes.  The next run of the same scenario in the folder deletes these.  For files
+that people may edit (the scenario, users' parts) the note also holds their SHA-256: a file that was edited is not deleted.  The
+folder is locked while a run writes into it.
+
+file in the folder                          a new run of the same scenario   a new run of another scenario
+written by an earlier run, unchanged        deletes it                       is refused, or with `replace` deletes it
+written by an earlier run, then edited      is refused if it needs the name  is refused if it needs the name
+not written by a run                        is refused if it needs the name  is refused if it needs the name
 """
 
 import json
@@ -28,7 +33,7 @@ from echelon.sim.run_state import STATE
 NOTE: Final = ".echelon.json"
 RECORDING: Final = "run.mcap"
 CUT: Final = "run.mcap.cut"
-"""The recording of a run that was killed, once it has been mended (echelon.sim.recovery)"""
+"""The recording of a killed run as it was before it was mended (echelon.sim.recovery)"""
 SUMMARY: Final = "summary.json"
 REPORT: Final = "report.html"
 TABLES: Final = ("csv", "parquet")
@@ -36,22 +41,26 @@ TABLES: Final = ("csv", "parquet")
 
 
 def run_files(plan: Plan, bus: bool) -> tuple[str, ...]:
-    """Returns the names of the files that a run may write; those of parts that others wrote come on top."""
+    """Returns the names of the files that a run may write, except for the files of users' parts.
+
+    `bus` says whether the run makes CAN frames."""
     return (EFFECTIVE, STATE, RECORDING, CUT, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
 
 
 @dataclass(slots=True)
 class OutFolder:
-    """A folder that a run has for itself."""
+    """The folder of a run, locked for it."""
 
     path: Path
     scenario: str
     stays: tuple[str, ...]
-    """What is in it, is not of this run, and might be taken for it: files of the same names, tables"""
+    """Names in the folder that are not of this run, but look as if they were: `can.blf`, tables"""
     _files: dict[str, str | None] = field(default_factory=dict)
 
     def note(self, files: Iterable[str], texts: Mapping[str, str]) -> None:
-        """Notes files as the run's, and the texts of files that it is about to write, by name.  Raises OSError."""
+        """Notes the files of the run: names in `files`, and in `texts` files that people may edit, with the run's texts.
+
+        Raises OSError."""
         self._files |= dict.fromkeys(files)
         self._files |= {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}
         write_text(self.path / NOTE, json.dumps({"scenario": self.scenario, "files": self._files}, indent=1) + "\n")
@@ -59,10 +68,11 @@ class OutFolder:
 
 @contextmanager
 def out_folder(scenario: str, out: Path | None, files: Iterable[str], replace: bool = False) -> Iterator[OutFolder]:
-    """Makes the folder of a run: `out`, or `runs/<scenario>-<utc time>`, for a run that writes `files`.
+    """A context with the folder of a run: `out`, by default `runs/<scenario>-<utc time>`.  It is made if it does not exist.
 
-    What an earlier run of the same scenario left there goes; of another scenario only if `replace` says so.  Raises UsageError
-    where a file is in the way, or a run goes on, and OSError."""
+    `scenario` is the name of the scenario, `files` are the names of the files that the run may write.  Files of an earlier run
+    are deleted: those of the same scenario, with `replace` those of any scenario.  Raises UsageError if a file is in the way or
+    a run goes on in the folder, and OSError."""
     path = _new(scenario) if out is None else out
     path.mkdir(parents=True, exist_ok=True)
     try:
@@ -79,7 +89,7 @@ def out_folder(scenario: str, out: Path | None, files: Iterable[str], replace: b
 
 
 def _new(scenario: str) -> Path:
-    """Makes `runs/<scenario>-<utc time>`; with a number if two runs begin in the same second."""
+    """Makes and returns `runs/<scenario>-<utc time>`, with a number at the end if another run began in the same second."""
     stamp, count = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ"), 1
     while True:
         path = Path("runs") / f"{scenario}-{stamp}{f'-{count}' if count > 1 else ''}"
@@ -93,7 +103,7 @@ def _new(scenario: str) -> Path:
 
 
 def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> None:
-    """Deletes what an earlier run left.  Raises UsageError if a file is in the way that it did not leave."""
+    """Deletes the files of an earlier run.  Raises UsageError, before anything is deleted, if a file is in the way."""
     with suppress(FileNotFoundError):
         if is_locked(path / RECORDING):
             raise UsageError(f"--out {path}: a run is going on there; give another folder")
@@ -108,7 +118,7 @@ def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> No
                 edited.add(name)
     for name in files:
         if name not in left and os.path.lexists(path / name):
-            why = "was changed after its run" if name in edited else "is there, and no run of echelon left it"
+            why = "was changed after its run" if name in edited else "exists, and no run of echelon wrote it"
             raise UsageError(f"--out {path}: {name} {why}; move it away, or give another folder")
     if earlier and left and earlier[0] != scenario and not replace:
         what = f"holds a run of the scenario {earlier[0]}, not {scenario}"
@@ -118,14 +128,14 @@ def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> No
 
 
 def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
-    """Returns the scenario of the run that a folder holds, and its files with their digests; None if it holds none."""
+    """Returns the scenario's name and the files of the run in a folder, with their SHA-256 or None; None if there is no run."""
     try:
         note = json.loads((path / NOTE).read_text(encoding="utf-8"))
         files = {str(name): digest for name, digest in note["files"].items() if Path(name).name == name}
         return str(note["scenario"]), files
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         pass
-    # A copy without the note: its recordings tell.
+    # There is no note, for example in a copy of the folder: the recording says what was run.
     scenario, files = "", dict[str, str | None]()
     for recording in (path / CUT, path / RECORDING):
         with suppress(OSError, ValueError, KeyError):
@@ -139,7 +149,7 @@ def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
 
 
 def _misleading(path: Path) -> Iterator[str]:
-    """Yields what is in a folder beside a run's files and looks as if it were of the run."""
+    """Yields the names in a folder that look like files of a run.  Called when those of earlier runs are deleted already."""
     stems = {name.partition(".")[0] for name in (RECORDING, SUMMARY, REPORT, LOG)} | {"torque", *TABLES}
     for entry in sorted(path.iterdir()):
         if entry.name.partition(".")[0].partition("-")[0] in stems:

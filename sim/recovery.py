@@ -1,6 +1,6 @@
-"""Rebuilds the folder of a run that was killed: the recording, the summary, the report, from what had been written.
+"""Rebuilds the folder of a run that was killed: the recording, the summary and the report, from what was written until then.
 
-What nobody wrote down is absent: wall time, counts of links, what became of frames besides those in can.log.
+The summary has no values for what was not written: wall time, counts of links, and frames that are not in can.log.
 """
 
 import os
@@ -39,18 +39,20 @@ from echelon.sim.run_folder import report_on
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What became of a run's folder: the files that were written, none if it was whole; why there is no report, if so."""
+    """The result of `recover_run`."""
 
     recording: RecoverResult
     files: tuple[str, ...]
+    """Names of the files that were written; empty if nothing was missing"""
     report_failure: str = ""
+    """Why there is no report; "" if there is one, or if nothing was written"""
 
 
 def recover_run(folder: Path) -> Recovered:
-    """Mends `run.mcap`, keeping the one that was cut as `run.mcap.cut`, and writes the summary and the report anew.
+    """Mends `run.mcap`, keeps the old one as `run.mcap.cut`, and writes the summary and the report.
 
-    The summary's verdict fails, for the run broke off.  A folder that is whole stays as it is.  Raises UserError where nothing
-    was recorded, or the run still goes on, and OSError."""
+    The verdict of that summary is FAILS, since the run broke off.  If nothing is missing in the folder, nothing is changed.
+    Raises UserError if there is no recording or the run still goes on, and OSError."""
     try:
         held = lock(folder)
     except BlockingIOError:
@@ -63,10 +65,10 @@ def recover_run(folder: Path) -> Recovered:
 
 def _recover(folder: Path) -> Recovered:
     recording, cut = folder / RECORDING, folder / CUT
-    if cut.exists() and not recording.exists():  # killed while it was mended
+    if cut.exists() and not recording.exists():  # an earlier recovery was killed here
         os.replace(cut, recording)
     try:
-        if is_locked(recording):  # the recorder is left of a run whose supervisor was killed
+        if is_locked(recording):  # the supervisor was killed, and the recorder has not ended yet
             raise UserError(f"{folder}: a run is going on there")
         mended = folder / f"{RECORDING}.mended"
         result = recover(recording, mended)
@@ -81,19 +83,20 @@ def _recover(folder: Path) -> Recovered:
             return Recovered(result, tuple(files))
         files += _rebuild(folder, recording, result)
     except FileNotFoundError as error:
-        raise UserError(f"{error.filename}: there is none: nothing of a run can be rebuilt without it") from None
-    except ValueError as error:  # which begins with the file
+        raise UserError(f"{error.filename}: not found; a run cannot be rebuilt without it") from None
+    except ValueError as error:  # its text begins with the name of the file
         raise UserError(str(error)) from None
     failure = ""
     try:
         report_on([folder], folder / REPORT)
         files.append(REPORT)
-    except (UserError, OSError) as error:  # of a run that was killed early there may be nothing to report
+    except (UserError, OSError) as error:  # a run that was killed early may have no states
         failure = f"no report: {error}"
     return Recovered(result, tuple(files), failure)
 
 
 def _has_summary(folder: Path) -> bool:
+    """Returns whether a folder has a summary that can be read."""
     with suppress(OSError, ValueError):
         read_summary(folder / SUMMARY)
         return True
@@ -101,7 +104,7 @@ def _has_summary(folder: Path) -> bool:
 
 
 def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
-    """Writes what a run's folder lacks, except for the report; returns the names of the files."""
+    """Writes the files that a run's folder lacks, and its summary, but not the report; returns the names of the files."""
     files: list[str] = []
     scenario = folder / EFFECTIVE
     if not scenario.exists() or not scenario.stat().st_size:
@@ -136,7 +139,7 @@ def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
 
 
 def _failure(trace: Trace, result: RecoverResult, counted: bool) -> str:
-    """Returns why the run broke off, as far as can be told afterwards."""
+    """Returns the summary's text about the run that broke off; `counted` says whether counts of links were recorded."""
     until_ns = max((int(times_ns[-1]) for times_ns in trace.times_ns if len(times_ns)), default=None)
     if until_ns is None:
         return "broken off: no state of a robot was recorded"
@@ -148,7 +151,7 @@ def _failure(trace: Trace, result: RecoverResult, counted: bool) -> str:
 
 
 def _drop_cut_line(log: Path) -> None:
-    """Cuts off what follows the last whole line: half a frame may look like a shorter one."""
+    """Removes an unfinished last line: half a frame may look like a frame with less data."""
     content = log.read_bytes()
     whole = content.rfind(b"\n") + 1
     if whole < len(content):
@@ -156,7 +159,7 @@ def _drop_cut_line(log: Path) -> None:
 
 
 def _report_of_log(plan: Plan, log: Path, clock: str) -> CanReport:
-    """Returns what can.log tells of the buses."""
+    """Returns the report on the buses, as far as can.log shows it; counts that it does not show are None."""
     counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, 0
     for time_ns, bus, (can_id, data, remote) in read_run_log(log, plan):
         counts[bus].add(can_id, data, remote)

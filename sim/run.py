@@ -1,8 +1,4 @@
-"""One run from scenario to folder: run it in one process or in many, then write what it leaves.
-
-The folder holds `scenario.toml` (effective), the files of parts that others wrote, `run.json`, `run.mcap`, `can.log`,
-`torque.dbc`, `summary.json` and `report.html`.
-"""
+"""Executes a run, in one process or in many, and writes its folder (docs/architecture.md, 6.1), except for the report."""
 
 import os
 import platform
@@ -36,7 +32,8 @@ from echelon.sim.kept_parts import keep_parts
 from echelon.sim.out_folder import SUMMARY, OutFolder
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
-from echelon.sim.processes.supervisor import Outcome, Progress, Supervisor
+from echelon.sim.processes.outcome import Outcome, Progress
+from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.processes.watchers import RunRecorder
 from echelon.sim.recording.time_order import TimeOrder, speakers
 from echelon.sim.results.records import ProcessResult, RunFacts, Summary
@@ -47,7 +44,7 @@ from echelon.sim.run_state import write_state
 from echelon.sim.view.live import Display
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
-"""Packages whose versions stand in a recording."""
+"""Packages whose versions are noted in the recording"""
 
 
 def execute(
@@ -62,17 +59,21 @@ def execute(
     stall_timeout_s: float = 30.0,
     keep_going: bool = False,
 ) -> tuple[Summary, Trace]:
-    """Runs a plan and writes the run's folder, except for the report; returns its summary and its trace.
+    """Runs a plan and writes the files of the run, except for the report; returns its summary and its trace.
 
-    A run ends at the first instant at which a robot's state is not finite, unless it is to `keep_going`.
-    Raises OSError if a file cannot be written, and ValueError too if, in one process, the bus cannot be had."""
+    `plan` is the plan of `scenario`, `out` the locked folder.  `engine` is `processes` or `inprocess`, `clock` is `virtual` or
+    `wall`.  `can_urls` has a URL for each bus, or none if the run makes no frames.  A run in virtual time without progress for
+    `stall_timeout_s` is given up.  A run ends at the first instant at which a robot's state is not finite, unless
+    `keep_going` is True.  A run that breaks off has its reason in the summary; its exception is not raised.
+
+    Raises OSError if a file cannot be written; in one process also OSError or ValueError if a bus cannot be opened."""
     begun, folder = datetime.now(UTC), out.path
     parts = keep_parts(scenario, folder)
     toml = effective_toml(scenario, parts.names)
     out.note((), {EFFECTIVE: toml, **parts.files})
     write_text(folder / EFFECTIVE, toml)
-    buses = dict(zip([bus.name for bus in plan.can.buses], can_urls, strict=False))  # without frames there are no URLs
-    write_state(folder, engine, clock, buses)
+    names = [bus.name for bus in plan.can.buses] if can_urls else []
+    write_state(folder, engine, clock, dict(zip(names, can_urls, strict=True)))
     metadata = {
         "scenario": scenario.name,
         "engine": engine,
@@ -116,7 +117,9 @@ def execute(
 
 
 def judged(log: Path, plan: Plan, clock: str, whole: bool, until_ns: int | None = None) -> RefereeReport:
-    """Returns what the referee finds in a run's can.log, up to `until_ns` if the run was stopped then."""
+    """Returns the referee's report on a run's can.log.
+
+    On a wall clock frames may be later, since processes wait for a processor.  `whole` and `until_ns` as in `judge_log`."""
     from echelon.bridge.referee.referee import judge_log
 
     tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
@@ -132,7 +135,9 @@ def _in_process(
     display: Display,
     stall_timeout_s: float,
 ) -> Outcome:
-    """The in-process engine with recorder and bridge beside it, in the same order of messages as between processes."""
+    """Runs a plan in one process, with recorder and bridge; returns its outcome.
+
+    Recorder and bridge get the messages in the same order as in a run as processes."""
     gathered: list[Message] = []
     engine = Engine(plan, gathered.append)
     recording = recorder()
@@ -143,8 +148,9 @@ def _in_process(
     failure: str | None = None
 
     def pass_on() -> None:
-        batch = gathered.copy()  # robots speak in their order, instant by instant
-        gathered.clear()  # whatever happens here, nothing is passed on twice
+        """Passes the gathered messages on to the bridge, and everything to the recorder."""
+        batch = gathered.copy()
+        gathered.clear()  # before anything can raise, so that nothing is passed on twice
         recording.add(order.push(batch))
         recording.add(order.push(bridge.take(batch)))
 
@@ -212,8 +218,9 @@ def _in_process(
 
 
 def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: datetime) -> RunFacts:
+    """Returns the facts about a run for its summary: how it was made, how fast it was, what it used."""
     common_ns, _ = outcome.trace.common()
-    # Robots move on through the period that begins at the last instant: so much was simulated.
+    # The period that begins at the last instant is simulated, too.
     simulated_s = (int(common_ns[-1]) + plan.robots[0].period_ns) / 1e9 if len(common_ns) else 0.0
     factor = simulated_s / outcome.wall_s if outcome.wall_s > 0 else None
     runners = [process.runner for process in outcome.processes if process.runner is not None]

@@ -1,4 +1,4 @@
-"""Reads back the folder of a run."""
+"""Reads the folder of a run, and writes its report."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -14,16 +14,17 @@ from echelon.shipped import EFFECTIVE
 from echelon.sim.finished_run import Run
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import CutError, read_trace
-from echelon.sim.report.report import RunForReport, write_report
+from echelon.sim.report.report import write_report
+from echelon.sim.report.run_for_report import RunForReport
 from echelon.sim.results.frames import FrameDecoder, frame_data
 from echelon.sim.results.rendering import read_summary
 
 FRAMES: Final = 18
-"""So many frames a report shows, from run time 0 on."""
+"""Number of CAN frames that a report shows, from run time 0 on"""
 
 
 def open_run(folder: Path) -> Run:
-    """Opens the folder that a run left.  Raises UserError."""
+    """Returns the run in a folder.  Raises UserError if a file of it is missing, damaged or not readable."""
     try:
         _, plan = load(folder / EFFECTIVE, trial=False)
         summary = read_summary(folder / "summary.json")
@@ -40,13 +41,13 @@ def open_run(folder: Path) -> Run:
         raise UserError(f"{folder / 'run.mcap'}: is cut short; `echelon recover {folder}` mends it") from None
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
-    except ValueError as error:  # which begins with the file
+    except ValueError as error:  # its text begins with the name of the file
         raise UserError(str(error)) from None
     return Run(trace, summary, folder)
 
 
 def runs_for_report(folders: Sequence[Path]) -> list[RunForReport]:
-    """Opens the folders of runs for a report.  Raises UserError and OSError."""
+    """Returns the runs in some folders, for a report.  Raises UserError as `open_run` does, and OSError."""
     return [_for_report(folder, name) for folder, name in zip(folders, run_names(folders), strict=True)]
 
 
@@ -57,8 +58,9 @@ def _for_report(folder: Path, name: str) -> RunForReport:
 
 
 def run_names(folders: Sequence[Path]) -> list[str]:
-    """Returns what runs are called: the end of their folders' paths, as short as tells them apart; the same folder twice is
-    numbered."""
+    """Returns a name for each run: the last parts of its folder's path, as few as are different for different folders.
+
+    Names of a folder that is given several times are numbered."""
     parts = [folder.resolve().parts for folder in folders]
     different = len(set(parts))
     for count in range(1, max(map(len, parts), default=1) + 1):
@@ -71,12 +73,14 @@ def run_names(folders: Sequence[Path]) -> list[str]:
 
 
 def report_on(folders: Sequence[Path], path: Path) -> None:
-    """Writes a report of runs.  Raises UserError and OSError."""
+    """Writes the report of the runs in some folders.  Raises UserError as `open_run` does, and OSError."""
     write_report(runs_for_report(folders), path)
 
 
 def first_frames(path: Path, plan: Plan, count: int = FRAMES) -> tuple[dict[str, object], ...]:
-    """Returns the first frames of a run in its can.log, decoded by its DBC; none if there is no log."""
+    """Returns the first `count` frames of a run from run time 0 on, decoded by its DBC; empty if can.log cannot be read.
+
+    Each frame is a row: texts by the names of the columns."""
     running = (logged for logged in read_run_log(path, plan) if logged[0] >= 0)
     try:
         first = list(islice(running, count))

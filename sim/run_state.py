@@ -1,6 +1,6 @@
-"""`run.json` in the folder of a run: how it is run and where its frames can be heard, from its first moment on.
+"""`run.json` in the folder of a run: how the run is made, and where its CAN frames can be heard.
 
-It says what summary.json, which is written at the end, cannot say while a run goes on, or after it was killed.
+It is written when a run begins; summary.json is written only at the end, and not at all if the run is killed.
 """
 
 import json
@@ -16,24 +16,26 @@ STATE: Final = "run.json"
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """How a run is run."""
+    """The content of run.json."""
 
     pid: int
-    """Of the process that runs it, or supervises its processes"""
+    """Process id of the process that runs the roles, or that supervises their processes"""
     engine: str
+    """`processes` or `inprocess`"""
     clock: str
+    """`virtual` or `wall`"""
     buses: dict[str, str]
-    """By name of the bus, the URL where its frames can be heard; none where there is no bus"""
+    """The URL of each bus, by its name; empty if the run makes no frames"""
 
 
 def write_state(folder: Path, engine: str, clock: str, buses: dict[str, str]) -> None:
-    """Notes that this process begins a run.  Raises OSError."""
+    """Writes run.json for a run of this process; `buses` are the URLs by the names of the buses.  Raises OSError."""
     state = RunState(os.getpid(), engine, clock, buses)
     write_text(folder / STATE, json.dumps(asdict(state), indent=2) + "\n")
 
 
 def read_state(folder: Path) -> RunState | None:
-    """Returns what is noted of a run; None if nothing is that can be read."""
+    """Returns the content of run.json in a run's folder; None if there is none or it cannot be read."""
     try:
         return RunState(**json.loads((folder / STATE).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
@@ -41,7 +43,7 @@ def read_state(folder: Path) -> RunState | None:
 
 
 def goes_on(folder: Path) -> bool:
-    """True while a run holds its folder and has not written its summary yet."""
+    """Returns whether a run goes on: it has its folder locked and has not written its summary yet."""
     try:
         return not (folder / "summary.json").exists() and is_locked(folder)
     except OSError:

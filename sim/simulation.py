@@ -1,4 +1,4 @@
-"""A run in one process, step by step, for those who want to look at it, or to meddle with it, in between."""
+"""A run in one process that is stepped from instant to instant; in between its states can be read and its commands changed."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -22,11 +22,11 @@ _STATE: Final = np.dtype([("robot", "U64"), *((name, "f8") for name in STATE_FIE
 
 
 class Simulation:
-    """A run in one process that moves when it is told to.
+    """A run in one process that goes on only when `step` or `run_until` is called.
 
         simulation = echelon.Simulation("lab")
         while not simulation.done:
-            simulation.commands[0] = 0.1, 0.0        # instead of what its leader wants
+            simulation.commands[0] = 0.1, 0.0        # [m/s²], replaces the command of the robot's leader
             simulation.step()
 
     Between two steps it stands at an instant `t` at which robots have said their states and leaders have said what
@@ -41,7 +41,7 @@ class Simulation:
         self.reset()
 
     def reset(self) -> None:
-        """Goes back to run time 0; where the torque path is closed, drives have been brought up by then."""
+        """Goes back to run time 0.  If the torque path is closed, the drives are brought up on the way."""
         self._trace = TraceBuilder(self.plan)
         self._last: dict[int, Array] = {}
         self._engine = Engine(self.plan, self._note)
@@ -50,8 +50,9 @@ class Simulation:
         self.done = False
         """True when the scenario's duration is over"""
         self.commands: Array = np.full((len(self.plan.robots), 2), np.nan)
-        """Accelerations (x, y) that the robots are about to act on, (robots, 2) [m/s²], NaN: none.  Write into it as you like.
-        A robot whose period does not begin at this instant acts on what its leader says when the next one does"""
+        """Accelerations (x, y) on which the robots are about to act, (robots, 2) [m/s²]; NaN for a robot without a command.
+        Values may be overwritten.  They hold for robots whose period begins at this instant; when the next period of a robot
+        begins, it gets its leader's command again"""
         self._moves = self._run()
         next(self._moves)
 
@@ -62,7 +63,7 @@ class Simulation:
 
     @property
     def states(self) -> Records:
-        """What the robots last said, one record each: `robot` and the fields of `echelon.messages.STATE_FIELDS`."""
+        """The last state of each robot, one record each: its name `robot` and the fields of `echelon.messages.STATE_FIELDS`."""
         table = np.zeros(len(self.plan.robots), dtype=_STATE)
         table["robot"] = [robot.name for robot in self.plan.robots]
         for index, values in self._last.items():
@@ -71,7 +72,7 @@ class Simulation:
         return table
 
     def step(self) -> float:
-        """Lets the robots act and moves on to the next instant; returns its run time [s].
+        """Lets the robots act on `commands` and goes on to the next instant; returns its run time [s].
 
         Raises UserError when the run is over (`done`)."""
         if self.done:
@@ -86,14 +87,14 @@ class Simulation:
         return self.t
 
     def result(self) -> Run:
-        """Returns the run so far, as `echelon.run` does; it has no folder."""
+        """Returns the run so far, as `echelon.run` returns a run.  It has no folder."""
         trace = self._trace.build()
         facts = RunFacts("inprocess", "virtual", 0.0, 0.0, None, None, self._engine.messages, None)
         return Run(trace, summarise(trace, self._engine.link_counts(), None, facts))
 
     @property
     def errors(self) -> dict[str, float]:
-        """|e| of every block in the robots' last states [m]."""
+        """Norm of each block's error [m], by the block's name, in the robots' last states."""
         builder = TraceBuilder(self.plan)
         for index, values in sorted(self._last.items()):
             builder.add(Message(Channel.STATE, index, 0, self._time_ns, values))
@@ -105,7 +106,7 @@ class Simulation:
         self._trace.add(message)
 
     def _run(self) -> Iterator[None]:
-        """Runs the whole plan; pauses at each instant from 0 on before robots act."""
+        """Runs the whole plan; pauses at each instant from run time 0 on, before the robots act."""
         engine = self._engine
         before = [row for row in engine.timetable if row.turn.value < Turn.ACT.value]
         after = [row for row in engine.timetable if row.turn.value >= Turn.ACT.value]

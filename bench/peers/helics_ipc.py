@@ -1,4 +1,4 @@
-"""HELICS with the ipc core: publications and inputs, each level of the tree one time step after the one before it."""
+"""HELICS with the ipc core: publications and inputs; each level of the tree runs one time step after the one before."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bench.tree import (
 )
 
 REQUIRES = ("helics",)
-_STEPS = 4  # of HELICS time in a tick: state, group state, reference, command
+_STEPS = 4  # steps of HELICS time in a tick: state, group state, reference, command
 _OFFSET = {"state": 1, "group": 2, "reference": 3, "command": 4}
 
 
@@ -97,7 +97,7 @@ def _channels(role: Role) -> tuple[list[str], dict[str, list[Role]]]:
 
 
 def run(ticks: int, folder: Path) -> None:
-    """Run the exchange, with one more process for the broker."""
+    """Runs the exchange, with a further process for the broker."""
     import multiprocessing
 
     context = multiprocessing.get_context("fork")

@@ -1,6 +1,6 @@
-"""mosaik with every simulator in a process of its own: four steps a tick, for states, groups, the reference, commands.
+"""mosaik with each simulator in its own process: four steps per tick, for states, group states, the reference, commands.
 
-Run as a module this file is one simulator; mosaik hands it the address of its world.
+Run as a module this file is one simulator; mosaik gives it the address of the world as an argument.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ATTRS = (["group", "reference"], ["state", "group", "reference", "command"], ["
 
 
 def run(ticks: int, folder: Path) -> None:
-    """Run the exchange, with one more process for mosaik's world."""
+    """Runs the exchange, with a further process for mosaik's world."""
     import multiprocessing
 
     run_processes([multiprocessing.get_context("fork").Process(target=_world, args=(ticks, folder), daemon=True)])

@@ -1,4 +1,4 @@
-"""Anonymous pipes: what the exchange costs when nothing but the kernel is in between."""
+"""Anonymous pipes: the cost of the exchange with only the kernel between the processes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Pipes(BlockingPorts):
 
 
 def run(ticks: int, folder: Path) -> None:
-    """Run the exchange."""
+    """Runs the exchange."""
     edges: list[tuple[str, Role, Role]] = []
     for leader in LEADERS:
         edges += [("group", leader, COORDINATOR), ("reference", COORDINATOR, leader)]

@@ -16,7 +16,7 @@ REQUIRES = ("zmq",)
 
 
 def connect(role: Role, folder: Path) -> Iterator[Ports]:
-    """Yield a role's sockets once every publisher knows its subscribers."""
+    """Yields a role's sockets when every publisher knows its subscribers."""
     import zmq
 
     context = zmq.Context()
@@ -74,12 +74,12 @@ _SENDERS = {"state": ROBOTS, "group": GROUPS, "reference": 1, "command": 1}
 
 
 def run(ticks: int, folder: Path) -> None:
-    """Run the exchange."""
+    """Runs the exchange."""
     run_roles(connect, ticks, folder)
 
 
 def run_batch(ticks: int, folder: Path) -> None:
-    """Run the exchange under the scheduling policy that a lockstep session sets."""
+    """Runs the exchange with the scheduling policy that a lockstep session sets, SCHED_BATCH."""
 
     def connect_batch(role: Role, folder: Path) -> Iterator[Ports]:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

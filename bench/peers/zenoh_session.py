@@ -1,4 +1,5 @@
-"""Zenoh, through the session all roles of this project use: a tree of links, each role at work where messages arrive."""
+"""Zenoh through `echelon.runtime.session`, which all roles of this project use: each role runs in the handler of its
+messages."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ TIMEOUT_S = 30.0
 
 
 class _Handler:
-    """Runs a role in the handler of the messages it waits for, as `echelon.runtime.runner` does."""
+    """Runs a role in the handler of the messages that it waits for, as `echelon.runtime.runner` does."""
 
     def __init__(self, senders: dict[str, int]) -> None:
         self._waiting: dict[str, deque[bytes]] = {channel: deque() for channel in senders}
@@ -55,7 +56,7 @@ class _Handler:
 
 
 def run(ticks: int, folder: Path) -> None:
-    """Run the exchange."""
+    """Runs the exchange."""
     from echelon.runtime.session import Session, loopback_endpoints
 
     endpoints = dict(zip((COORDINATOR, *LEADERS), loopback_endpoints(1 + len(LEADERS)), strict=True))

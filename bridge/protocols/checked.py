@@ -17,8 +17,9 @@ from math import isfinite
 from typing import Any, Self
 
 from echelon.bridge.protocols.cyclic import CyclicHost
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Drive, Frame, Host, Master
-from echelon.bridge.protocols.motor import Fault, Motor
+from echelon.bridge.protocols.motor import Motor
 from echelon.bridge.protocols.observe import Finding, Observer, WheelReading
 from echelon.bridge.protocols.protocol import DriveProtocol
 from echelon.errors import PartRunError

@@ -7,7 +7,8 @@ Frames from the bus never raise: an invalid frame is counted in `refused` by its
 from collections import Counter
 from typing import Final, NamedTuple, Protocol
 
-from echelon.bridge.protocols.motor import Fault, Motor
+from echelon.bridge.protocols.faults import Fault
+from echelon.bridge.protocols.motor import Motor
 from echelon.plan.can_plan import DrivePlan
 
 WHEELS: Final = ("right", "left")

@@ -6,60 +6,38 @@ the setpoint.  Between two events the setpoint is s + k t, and the solution is e
 
     τ = s + k (t - lag) + (τ0 - s + k lag) e^(-t/lag)
 
-*Slow quantities* are updated every 10 ms, at multiples of `STEP_NS`.  So they do not depend on the times of calls.  I is the
-current τ/torque_constant.
+*Slow quantities* are updated every 10 ms, at multiples of `STEP_NS`, so they do not depend on when the motor is called: the
+winding temperature and the supply voltage at the drive (equations in `protocols.motor_physics`), by the means over the step of
+the copper loss resistance · I² with I = τ/torque_constant, and of the power τ ω + resistance · I²; and the velocity, by the
+encoder counts of the step.
 
-- Winding temperature T: thermal_time T' = ambient + thermal_resistance · resistance · I² - T, solved exactly for the mean of
-  I² over the step.
-- Supply voltage V at the drive: V = supply_voltage - supply_resistance · P/V, with P the mean of τ ω + resistance · I² over the
-  step.  Of the two roots of this quadratic equation the larger one is stable.  If there is none, the supply cannot deliver
-  P; V is then half the supply voltage, where it delivers most.
-- Velocity: encoder counts over the step.
-
-*A wheel on a bench*, which no robot turns, moves by inertia ω' = τ - friction ω with the mean torque between two events.  This
-is exact while τ is constant.  While τ lags, the error is small, since events are milliseconds apart.
+*A wheel on a bench*, which no robot turns, moves by inertia ω' = τ - friction ω with the mean torque between two events: exact
+while τ is constant, and with a small error while it lags, since events are milliseconds apart.
 """
 
-from enum import StrEnum
-from math import exp, expm1, floor, isfinite, sqrt, tau
-from typing import Final
+from math import exp, expm1, floor, isfinite, tau
 
+from echelon.bridge.protocols.faults import LATCHING, Fault
+from echelon.bridge.protocols.motor_physics import (
+    STEP,
+    STEP_NS,
+    check,
+    supply_voltage,
+    torque_limit,
+    turned_freely,
+    winding_temperature,
+)  # fmt: skip
 from echelon.plan.can_plan import MotorPlan
-
-STEP_NS: Final = 10_000_000
-STEP: Final = STEP_NS * 1e-9
-"""Temperature, bus voltage and velocity are measured at multiples of this [s]."""
-
-
-class Fault(StrEnum):
-    """Faults of a drive.  All but `STUCK_TORQUE` and `SILENT` take the torque away and latch."""
-
-    OVER_TEMPERATURE = "over_temperature"
-    ENCODER_LOSS = "encoder_loss"
-    BROWN_OUT = "brown_out"
-    STUCK_TORQUE = "stuck_torque"
-    """The shaft torque does not change while the fault lasts, whatever is commanded."""
-    SILENT = "silent"
-    """The drive receives and sends nothing while the fault lasts; its torque is zero."""
-    WATCHDOG = "watchdog"
-    ESTOP = "estop"
-
-
-LATCHING: Final = (Fault.OVER_TEMPERATURE, Fault.ENCODER_LOSS, Fault.BROWN_OUT)
-"""Faults on demand that the drive latches."""
-ON_DEMAND: Final = (*LATCHING, Fault.STUCK_TORQUE, Fault.SILENT)
-"""Faults that a scenario can make happen; the others come from frames on the bus, or from their absence."""
 
 
 class Motor:
-    """The motor of one wheel.  Instants are in ns, all else in SI units.  The first call sets the time.
-
+    """The motor of one wheel.  Instants are integers [ns], temperatures are in °C, the encoder's position and velocity in rev
+    and rev/s, all else in SI units.  The first call sets the time.
     Raises ValueError for an impossible value in the plan, for time that runs backwards, and for a torque or a speed that is not
-    finite.
-    """
+    finite."""
 
     def __init__(self, plan: MotorPlan) -> None:
-        _check(plan)
+        check(plan)
         self.plan = plan
         self._thermal_decay = exp(-STEP / plan.thermal_time) if plan.thermal_time else 0.0
         self._now_ns: int | None = None
@@ -73,7 +51,7 @@ class Motor:
         self._temperature, self._voltage = plan.ambient, plan.supply_voltage
         self._omega = self._turned = self._velocity = 0.0  # [rad/s], [rad], [rev/s]
         self._counts = 0  # at the last step
-        self._counts_lost = 0  # encoder counts when the encoder was lost
+        self._counts_lost = 0  # encoder counts at the instant at which the encoder was lost
         self._driven = self._stuck = False
         self._injected: set[Fault] = set()
         self._tripped: Fault | None = None
@@ -136,7 +114,7 @@ class Motor:
 
     @property
     def causes(self) -> frozenset[Fault]:
-        """Faults whose cause is present, on demand or by physics.  A drive cannot clear them."""
+        """The faults whose cause is present: caused by a scenario, or by temperature or voltage.  A drive cannot clear them."""
         found = self._injected - {Fault.STUCK_TORQUE}
         if self._temperature >= self.plan.temperature_limit:
             found.add(Fault.OVER_TEMPERATURE)
@@ -145,10 +123,8 @@ class Motor:
         return frozenset(found)
 
     def advance(self, time_ns: int) -> Fault | None:
-        """Lets time pass; returns a fault that physics caused by then: over-temperature or brown-out.
-
-        The motor cuts the torque at the instant of the fault, even if `advance` is called later.
-        """
+        """Lets time pass; returns the fault that the motor itself has had since the last call, or None: over-temperature or
+        brown-out.  The torque is cut at the instant of the fault, even if `advance` is called later."""
         self._go(time_ns)
         fault, self._tripped = self._tripped, None
         return fault
@@ -168,7 +144,7 @@ class Motor:
         self._cut()
 
     def set_speed(self, time_ns: int, omega: float) -> None:
-        """Sets the speed at which a robot turns the wheel [rad/s].  Without any call the wheel is on a bench."""
+        """Sets the speed at which the robot turns the wheel [rad/s].  If it is never called, the wheel is on a bench."""
         if not isfinite(omega):
             raise ValueError(f"speed must be finite, not {omega!r}")
         self._go(time_ns)
@@ -184,9 +160,7 @@ class Motor:
 
     def inject(self, time_ns: int, fault: Fault) -> None:
         """Makes a fault happen: one of `LATCHING` cuts the torque, `STUCK_TORQUE` freezes it.
-
-        Raises ValueError for all others, which are faults of the drive, not of the motor.
-        """
+        Raises ValueError for all others, which are faults of the drive, not of the motor."""
         self._go(time_ns)
         if fault not in (*LATCHING, Fault.STUCK_TORQUE):
             raise ValueError(f"no fault of a motor: {fault!r}; there are {', '.join(LATCHING)}, {Fault.STUCK_TORQUE}")
@@ -198,7 +172,7 @@ class Motor:
             self._cut()
 
     def mend(self, time_ns: int, fault: Fault) -> None:
-        """Takes the cause of a fault away.  After `STUCK_TORQUE` the torque follows the commands again."""
+        """Removes the cause of a fault.  After `STUCK_TORQUE` the torque follows the commands again."""
         self._go(time_ns)
         self._injected.discard(fault)
         if fault is Fault.STUCK_TORQUE and self._stuck:
@@ -209,6 +183,7 @@ class Motor:
                 self._torque = self._setpoint
 
     def _go(self, time_ns: int) -> None:
+        """Moves the motor to an instant, step by step."""
         now_ns = self._now_ns
         if now_ns is None:
             self._now_ns = self._window_ns = time_ns
@@ -243,7 +218,8 @@ class Motor:
         if self._driven:
             self._turned += self._omega * h
         else:
-            self._turn(area / h, h)
+            self._omega, angle = turned_freely(self.plan, self._omega, area / h, h)
+            self._turned += angle
 
     def _follow(self, h: float, slew: float) -> None:
         """Integrates the shaft torque over `h` [s] while the setpoint changes by `slew` [N m/s]."""
@@ -267,26 +243,14 @@ class Motor:
             b *= 1 - gone
         self._torque = a + slew * h + b
 
-    def _turn(self, torque: float, h: float) -> None:
-        """Turns a wheel on a bench for `h` [s] with a constant torque; the solution is exact."""
-        x = self.plan.friction * h / self.plan.inertia
-        part = -expm1(-x) / x if x else 1.0
-        rest = (1 - part) / x if x > 1e-5 else 0.5 - x / 6  # a series, since 1 - part cancels for small x
-        gain = torque * h / self.plan.inertia
-        self._turned += (self._omega * part + gain * rest) * h
-        self._omega = self._omega * exp(-x) + gain * part
-
     def _step(self) -> None:
         """Updates the slow quantities, at a multiple of STEP_NS."""
         plan = self.plan
         self._next_ns += STEP_NS
         copper = plan.resistance * self._square / (STEP * plan.torque_constant * plan.torque_constant)
-        if plan.supply_resistance:
-            root = plan.supply_voltage**2 / 4 - plan.supply_resistance * (self._work / STEP + copper)
-            self._voltage = plan.supply_voltage / 2 + (sqrt(root) if root > 0 else 0.0)
+        self._voltage = supply_voltage(plan, self._work / STEP + copper)
         self._square = self._work = 0.0
-        warm = plan.ambient + plan.thermal_resistance * copper
-        temperature = warm + (self._temperature - warm) * self._thermal_decay
+        temperature = winding_temperature(plan, self._temperature, copper, self._thermal_decay)
         if temperature != self._temperature:
             self._temperature = temperature
             self._derate()
@@ -299,11 +263,8 @@ class Motor:
         self._counts = counts
 
     def _derate(self) -> None:
-        plan = self.plan
-        limit = plan.torque_limit
-        if self._temperature > plan.derating_from:
-            span = plan.temperature_limit - plan.derating_from
-            limit *= max(plan.temperature_limit - self._temperature, 0.0) / span if span else 0.0
+        """Updates the torque limit to the temperature."""
+        limit = torque_limit(self.plan, self._temperature)
         if limit != self._limit:
             self._limit = limit
             self._aim()
@@ -323,27 +284,17 @@ class Motor:
                 self._torque = target
 
     def _cut(self) -> None:
+        """Switches the power stage off at the present instant."""
         self._off = True
         self._wanted = self._target = self._setpoint = 0.0
         if not self._stuck:
             self._torque = 0.0
 
     def _trip(self, fault: Fault) -> None:
+        """Cuts the torque because of a fault, which the next `advance` returns."""
         self._tripped = fault
         self._cut()
 
     def _encoder(self) -> int:
+        """Returns the counts of an encoder that works."""
         return floor(self._turned / tau * self.plan.encoder_counts)
-
-
-def _check(plan: MotorPlan) -> None:
-    for name in ("torque_limit", "torque_slew", "torque_constant", "supply_voltage", "encoder_counts", "inertia"):
-        if not getattr(plan, name) > 0:
-            raise ValueError(f"{name} must be positive, not {getattr(plan, name)!r}")
-    for name in ("lag", "resistance", "thermal_resistance", "thermal_time", "supply_resistance", "friction"):
-        if not getattr(plan, name) >= 0:
-            raise ValueError(f"{name} must not be negative, nor nan, but is {getattr(plan, name)!r}")
-    if not plan.derating_from <= plan.temperature_limit:
-        raise ValueError(
-            f"derating_from must be at most temperature_limit {plan.temperature_limit!r}, not {plan.derating_from!r}"
-        )

@@ -224,13 +224,15 @@ def judge_log(
     that was stopped, only frames up to `until_ns` are judged: some processes go on for a while, others do not.
     Raises OSError if the log cannot be read."""
     referee = Referee(plan, tolerance_ns=tolerance_ns)
-    last_ns = 0
+    last_ns = later = 0
     for time_ns, bus, frame in read_run_log(path, plan):
         if until_ns is None or time_ns <= until_ns:
             last_ns = time_ns
             referee.observe(time_ns, bus, frame)
+        else:
+            later += 1
     referee.finish(max(last_ns, plan.duration_ns) if whole else last_ns)
-    return replace(referee.report(), until=None if until_ns is None else until_ns / 1e9)
+    return replace(referee.report(), until=None if until_ns is None else until_ns / 1e9, later=later)
 
 
 def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, TimedFrame, pack, unpack
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Drive, Frame
-from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.registry import DrivePlace, drive_places, make_drive
 from echelon.bridge.reports import DriveReport, DrivesReport
 from echelon.bridge.timing.buses import lost_report

@@ -9,9 +9,7 @@ the same identifier, a data frame goes before a remote frame, and then the frame
 *Errors.*  An attempt to send is destroyed with a given probability, at a random bit (bridge.timing.error_draws).  Error flag,
 echo, delimiter and interframe space follow; then the frame waits again.
 
-*Error counters* follow ISO 11898-1, as far as a bus with one error at a time needs it.  Each node has a transmit error counter
-(TEC) and a receive error counter (REC) and counts from its first frame on.  A destroyed frame adds 8 to the TEC of its sender
-and 1 to the REC of each other node.  A delivered frame takes 1 from the TEC of its sender and 1 from each other REC.
+*Error states.*  The error counters (bridge.timing.error_counters) decide about a node's state.
 
 state           entered when                                    what the node does
 error active    at first; both counters are at most 127         sends without restrictions
@@ -20,33 +18,28 @@ bus-off         TEC is over 255, or `bus_off` was called        does not send or
                                                                 `restart_ns` later it starts to count idle times; after 128
                                                                 times 11 recessive bits it is error active, counters at zero
 
-*Frames of other processes.*  This model does not have their queues; it learns of them by `hear` when they are over.  If the
-bus was free, it was occupied by such a frame just before.  Otherwise the frame waits with the others and occupies the bus
-later.  So several models that hear each other share one bus.
+*Frames of other processes* are not in the queues of this model; `hear` tells it of them when they are over.  If the model's bus
+was free, it counts as occupied by the frame just before.  Otherwise the frame waits with the others and occupies the bus later.
+In this way several models that hear each other stand for one bus.
 """
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.timing.bus_load import frame_bits
 from echelon.bridge.timing.bus_model import BusEvent, BusEventKind, BusModel, Delivered, Traffic
+from echelon.bridge.timing.bus_off import OffNodes
+from echelon.bridge.timing.error_counters import ErrorCounters, NodeErrors
 from echelon.bridge.timing.error_draws import INTERFRAME, ErrorDraws
 
 CAPACITY = 64
 """Default length of a node's queue [frames] (SocketCAN's default is 10)"""
-PASSIVE_OVER, OFF_OVER = 127, 255
-RECOVERED_REC = 119  # REC of an error passive receiver after a good frame: the standard allows 119 .. 127
-
-_ERROR_FLAG, _ERROR_DELIMITER = 6, 8
-_SUSPEND = 8
-_RECESSIVE, _RECESSIVE_RUNS = 11, 128
-_EVER = -(2**62)
-_NEVER = 2**62
-_OTHERS = -1  # node number of all frames that other processes sent
+_ERROR_FLAG, _ERROR_DELIMITER, _SUSPEND = 6, 8, 8
+_EVER, _NEVER = -(2**62), 2**62
+_OTHERS = -1  # node number for all frames of other processes
 
 
 class _Waiting(NamedTuple):
@@ -58,24 +51,6 @@ class _Waiting(NamedTuple):
     node: int
     frame: Frame
     bits: int
-
-
-@dataclass(slots=True)
-class _Node:
-    """A node: number of frames in its queue, error counters, and whether it is error passive."""
-
-    held: int = 0
-    tec: int = 0
-    rec: int = 0
-    passive: bool = False
-
-
-@dataclass(slots=True)
-class _Off:
-    """The recovery of a node that is bus-off: it counts from `from_ns` on, and still needs `runs` times 11 recessive bits."""
-
-    from_ns: int
-    runs: int = _RECESSIVE_RUNS
 
 
 class ArbitratedBus(BusModel):
@@ -101,28 +76,27 @@ class ArbitratedBus(BusModel):
         for name, value, least in (("bit rate", bitrate, 1), ("capacity", capacity, 1), ("restart_ns", restart_ns, 0)):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, not {value!r}")
-        self.bitrate = bitrate
-        self.capacity = capacity
-        self.restart_ns = restart_ns
+        self.bitrate, self.capacity, self.restart_ns = bitrate, capacity, restart_ns
         self.events: list[BusEvent] = []
         self._note_errors = note_errors
         self._traffic: defaultdict[int, Traffic] = defaultdict(Traffic)
-        self._nodes: defaultdict[int, _Node] = defaultdict(_Node)
+        self._held: defaultdict[int, int] = defaultdict(
+            int
+        )  # frames in the queue of each node, the one on the bus included
+        self._counters = ErrorCounters()
         self._pending: list[_Waiting] = []  # heap
         self._current: _Waiting | None = None
         self._destroyed = False
         self._end_ns = _EVER  # end of the current attempt: the frame is delivered or destroyed then
         self._free_ns = _EVER  # when the bus is free after the current attempt
         self._suspended: dict[int, int] = {}  # the error passive node that sent last, and when it may start again
-        self._off: dict[int, _Off] = {}
-        self._marked: set[int] = set()  # nodes with an error counter above zero
+        self._off = OffNodes(bitrate)
         self._delivered: list[Delivered] = []
         self._began_ns: int | None = None
         self._now_ns = _EVER  # the model is decided up to this instant
-        self._order = self._busy_ns = 0
+        self._order = self._busy_ns = self._attempts = 0
         self._others = 0  # number of waiting frames of other processes
         self._draws = ErrorDraws(seed, bus_number)
-        self._attempts = 0
         self.set_error_rate(error_rate)
 
     @property
@@ -135,10 +109,8 @@ class ArbitratedBus(BusModel):
             return self._end_ns
         if not self._pending:
             return None
-        if self._rate or self._suspended or self._off:
-            return (
-                self._next_start() + 1
-            )  # only at its start is it known which frame is sent, and whether it is destroyed
+        if self._rate or self._suspended or self._off.nodes:
+            return self._next_start() + 1  # only then it is known which frame is sent, and whether it is destroyed
         return self._next_start() + self._span(self._pending[0].bits - INTERFRAME)
 
     @property
@@ -152,7 +124,7 @@ class ArbitratedBus(BusModel):
 
     def counters(self, node: int) -> tuple[int, int]:
         """Returns the transmit and the receive error counter of a node."""
-        known = self._nodes.get(node, _Node())
+        known = self._counters.nodes.get(node, NodeErrors())
         return known.tec, known.rec
 
     def duration_ns(self, frame: Frame) -> int:
@@ -161,12 +133,13 @@ class ArbitratedBus(BusModel):
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
         bits = frame_bits(frame.can_id, frame.data, frame.remote)
         self._advance(time_ns)
-        traffic, sender = self._traffic[frame.can_id], self._nodes[node]
+        traffic = self._traffic[frame.can_id]
         traffic.sent += 1
-        if sender.held == self.capacity:
+        self._counters.nodes[node]  # it counts from its first frame on
+        if self._held[node] == self.capacity:
             traffic.lost += 1
             return False
-        sender.held += 1
+        self._held[node] += 1
         self._order += 1
         heappush(self._pending, _Waiting(frame.can_id * 2 + frame.remote, self._order, time_ns, node, frame, bits))
         return True
@@ -198,7 +171,7 @@ class ArbitratedBus(BusModel):
         self._rate = rate
 
     def is_off(self, node: int) -> bool:
-        return node in self._off
+        return node in self._off.nodes
 
     def clear(self, node: int) -> int:
         kept = [waiting for waiting in self._pending if waiting.node != node]
@@ -206,16 +179,17 @@ class ArbitratedBus(BusModel):
             if waiting.node == node:
                 self._traffic[waiting.frame.can_id].lost += 1
         count = len(self._pending) - len(kept)
-        self._nodes[node].held -= count
+        self._held[node] -= count
         self._pending = kept
         heapify(self._pending)
         return count
 
     def bus_off(self, node: int) -> None:
-        if node not in self._off:
+        if node not in self._off.nodes:
             self._go_off(self._now_ns, node)
 
     def _span(self, bits: int) -> int:
+        """Returns how long some bits last [ns], rounded up."""
         return -(-bits * 1_000_000_000 // self.bitrate)
 
     def _advance(self, until_ns: int) -> None:
@@ -230,7 +204,7 @@ class ArbitratedBus(BusModel):
                     break
                 self._finish(self._current)
             start_ns = self._next_start()
-            if self._off:
+            if self._off.nodes:
                 self._recover(min(start_ns, until_ns))
             if start_ns >= until_ns:
                 break
@@ -242,30 +216,23 @@ class ArbitratedBus(BusModel):
         if not self._pending:
             return _NEVER
         start_ns = max(self._now_ns, self._free_ns)
-        if self._off or self._suspended:
+        if self._off.nodes or self._suspended:
             start_ns = max(start_ns, min(self._ready_ns(waiting.node) for waiting in self._pending))
         return start_ns
 
     def _ready_ns(self, node: int) -> int:
         """Returns from when on a node may start, if the bus is idle until then."""
-        if node in self._off:
-            off = self._off[node]
-            return self._recessive_from(off) + self._span(off.runs * _RECESSIVE)
+        if node in self._off.nodes:
+            return self._off.ready_ns(node, self._free_ns)
         return self._suspended.get(node, _EVER)
 
-    def _recessive_from(self, off: _Off) -> int:
-        # The bus is recessive before it is free: acknowledge delimiter, end of frame and interframe space are 11 bits; error
-        # delimiter and interframe space are also 11.
-        return max(off.from_ns, self._free_ns - self._span(_RECESSIVE))
-
     def _begin(self, start_ns: int) -> None:
+        """Starts the next attempt to send, and decides whether it is destroyed."""
         current = self._pop(start_ns)
         self._note_start(start_ns)
-        hit = (
-            self._draws.hit(self._attempts, self._rate, current.bits)
-            if self._rate and current.node != _OTHERS
-            else None
-        )
+        hit = None
+        if self._rate and current.node != _OTHERS:
+            hit = self._draws.hit(self._attempts, self._rate, current.bits)
         if hit is None:
             on_bus, end = current.bits, current.bits - INTERFRAME
         else:
@@ -280,13 +247,12 @@ class ArbitratedBus(BusModel):
     def _note_start(self, start_ns: int) -> None:
         """Notes that a frame starts: the idle time before counts for nodes that are bus-off, and suspension ends."""
         self._suspended.clear()
-        for off in self._off.values():
-            idle_ns = max(0, start_ns - self._recessive_from(off))
-            off.runs -= idle_ns * self.bitrate // (_RECESSIVE * 1_000_000_000)
+        if self._off.nodes:
+            self._off.count_idle(start_ns, self._free_ns)
 
     def _pop(self, start_ns: int) -> _Waiting:
         """Takes the first waiting frame whose node may start."""
-        if not (self._off or self._suspended):
+        if not (self._off.nodes or self._suspended):
             return heappop(self._pending)
         aside = []
         while self._ready_ns((first := heappop(self._pending)).node) > start_ns:
@@ -296,6 +262,7 @@ class ArbitratedBus(BusModel):
         return first
 
     def _finish(self, current: _Waiting) -> None:
+        """Ends the present attempt: the frame is delivered, or waits again."""
         end_ns, node, can_id = self._end_ns, current.node, current.frame.can_id
         self._current = None
         if node == _OTHERS:
@@ -307,47 +274,27 @@ class ArbitratedBus(BusModel):
             heappush(self._pending, current)
         else:
             self._traffic[can_id].deliver(end_ns - current.queued_ns)
-            self._nodes[node].held -= 1
+            self._held[node] -= 1
             self._delivered.append(Delivered(current.queued_ns, end_ns, node, current.frame))
         self._count(end_ns, node, self._destroyed)
-        if node != _OTHERS and self._nodes[node].passive:
+        if node != _OTHERS and self._counters.nodes[node].passive:
             self._suspended[node] = self._free_ns + self._span(_SUSPEND)
 
     def _count(self, time_ns: int, sender: int, destroyed: bool) -> None:
-        """Updates all error counters after an attempt."""
-        for node in sorted(self._nodes if destroyed else self._marked):
-            if node in self._off:
-                continue
-            state = self._nodes[node]
-            if node == sender:
-                state.tec = state.tec + 8 if destroyed else max(0, state.tec - 1)
-            elif destroyed:
-                state.rec = min(PASSIVE_OVER + 1, state.rec + 1)
-            else:
-                state.rec = RECOVERED_REC if state.rec > PASSIVE_OVER else max(0, state.rec - 1)
-            if state.tec or state.rec:
-                self._marked.add(node)
-            else:
-                self._marked.discard(node)
-            if state.tec > OFF_OVER:
+        """Updates all error counters after an attempt, and the states that depend on them."""
+        for node, kind in self._counters.count(sender, destroyed, self._off.nodes):
+            if kind is BusEventKind.OFF:
                 self._go_off(time_ns, node)
-                continue
-            passive = max(state.tec, state.rec) > PASSIVE_OVER
-            if passive != state.passive:
-                state.passive = passive
-                kind = BusEventKind.PASSIVE if passive else BusEventKind.ACTIVE
+            else:
                 self.events.append(BusEvent(time_ns, node, kind))
 
     def _go_off(self, time_ns: int, node: int) -> None:
-        self._off[node] = _Off(time_ns + self.restart_ns)
+        """Makes a node bus-off."""
+        self._off.add(node, time_ns + self.restart_ns)
         self.events.append(BusEvent(time_ns, node, BusEventKind.OFF))
 
     def _recover(self, until_ns: int) -> None:
         """Ends bus-off for the nodes that have recovered by `until_ns`."""
-        back = sorted((self._ready_ns(node), node) for node in self._off)
-        for time_ns, node in back:
-            if time_ns <= until_ns:
-                del self._off[node]
-                self._nodes[node] = _Node(self._nodes[node].held)
-                self._marked.discard(node)
-                self.events.append(BusEvent(time_ns, node, BusEventKind.RECOVERED))
+        for time_ns, node in self._off.remove_recovered(until_ns, self._free_ns):
+            self._counters.reset(node)
+            self.events.append(BusEvent(time_ns, node, BusEventKind.RECOVERED))

@@ -1,1 +1,1 @@
-"""What can be said of a run without running it."""
+"""Predictions about a run without running it: stability, and how much delay it bears."""

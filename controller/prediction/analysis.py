@@ -1,4 +1,5 @@
-"""All that `echelon analyse` says of a plan (docs/architecture.md, 2.7): as it is, and how much later messages may be."""
+"""The predictions of `echelon analyse` about a plan (docs/architecture.md, 2.7): whether it is stable, and how much later its
+messages may be."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -16,52 +17,53 @@ from echelon.plan.plan import LinkPlan, Plan
 
 @dataclass(frozen=True, slots=True)
 class BlockMargin:
-    """A block alone, in continuous time, with its law as it stands (without `lead`)."""
+    """The delay margin of a block alone, in continuous time, with its law without `lead`."""
 
     name: str
     sigma: float
-    """[s]"""
+    """Time scale σ [s]"""
     margin: float | None
-    """The largest delay that it bears [s]; None if it is unstable without any"""
+    """The largest delay for which it is stable [s]; None if it is unstable even without delay"""
 
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """What is predicted of the linear run of a plan."""
+    """The predictions about a plan, by its linear run (`prediction.linear_run`)."""
 
     delays: dict[Channel, tuple[float, ...]]
-    """The delays [s] that the links of each channel have in the scenario, each once, in ascending order"""
+    """For each channel the delays of its links in the scenario [s], each once, in ascending order"""
     acceleration_periods: tuple[float, ...]
-    """Of the nodes [s], each once"""
+    """The acceleration periods of the nodes [s], each once, in ascending order"""
     torque_periods: tuple[float, ...]
-    """Of the robots [s], each once"""
+    """The torque periods of the robots [s], each once, in ascending order"""
     blocks: tuple[BlockMargin, ...]
     hyperperiod: float
-    """[s]"""
+    """Period of the root [s]; all other periods divide it"""
     radius: float
-    """Spectral radius of the run's map over one hyperperiod: errors are multiplied by it in the long run"""
+    """Spectral radius of the run's map over one hyperperiod: in the long run errors are multiplied by it in each hyperperiod"""
     later: dict[Channel, LargestDelay]
-    """By channel how much later all its messages may be, beyond the delays that they have; empty if that is unstable already"""
+    """For each channel how much later all of its messages may be than in the scenario; empty if the scenario itself is
+    unstable"""
     centroid_age: float
-    """How old, on average over the robots, positions are when the coordinator uses them [s]: a formation that moves with a
-    constant velocity is off by that much of its way, which is no instability"""
+    """Mean age over the robots of their positions when the coordinator uses them [s].  A formation that moves with a constant
+    velocity has a steady error of velocity times this age, which is not an instability"""
 
     @property
     def settles(self) -> bool:
-        """True if errors vanish in the long run."""
+        """True if errors decay in the long run."""
         return self.radius < 1
 
     @property
     def time_constant(self) -> float:
-        """The time [s] in which errors shrink, or grow, by the factor e in the long run."""
+        """The time in which errors decay, or grow, by the factor e in the long run [s]: hyperperiod/|ln radius|."""
         return inf if self.radius == 1 else self.hyperperiod / abs(log(self.radius)) if self.radius > 0 else 0.0
 
 
 def analyse(plan: Plan) -> Analysis:
-    """Returns what is predicted of a plan.
+    """Returns the predictions about a plan.
 
-    Raises PredictionError if nothing exact can be said: the law is not linear, links lose messages or have delays that vary,
-    messages are older than their timeout when they would be used, or too many messages are on their way."""
+    Raises PredictionError if no exact prediction is possible: the law is not linear, links lose messages or have varying
+    delays, messages are older than their timeout when they would be used, or delays are so long that the map is too large."""
     blocks = tuple(
         BlockMargin(block.name, block.sigma, delay_margin(linear_gains(plan, block, 0.0)))
         for block in plan.blocks
@@ -86,7 +88,7 @@ def analyse(plan: Plan) -> Analysis:
 
 
 def describe_untreated(links: Sequence[LinkPlan]) -> str:
-    """Returns which links lose messages or have delays that vary: channels, how many links, and what they are like."""
+    """Returns in words how many links of which channels lose messages or have varying delays; `links` are such links."""
 
     def like(link: LinkPlan) -> str:
         low, high = link.delay_min_ns / 1e9, link.delay_max_ns / 1e9
@@ -98,7 +100,7 @@ def describe_untreated(links: Sequence[LinkPlan]) -> str:
 
 
 def _centroid_age(plan: Plan) -> float:
-    """Returns how old robots' positions are when the coordinator uses them [s], on average."""
+    """Returns the mean age of the robots' positions when the coordinator uses them [s]."""
     links = {(link.source, link.receiver): link for link in plan.links if link.channel in _UP}
     ages = []
     for robot in plan.robots:
@@ -115,5 +117,5 @@ _UP = (Channel.STATE, Channel.GROUP_STATE)
 
 
 def _each_once(instants_ns: Iterable[int]) -> tuple[float, ...]:
-    """Returns numbers in seconds, each once, in ascending order."""
+    """Returns times in seconds, each once, in ascending order."""
     return tuple(each / 1e9 for each in sorted(set(instants_ns)))

@@ -1,6 +1,7 @@
-"""How much delay one block bears alone, in continuous time (docs/architecture.md, 2.7).
+"""The largest delay for which one block alone is stable, in continuous time (docs/architecture.md, 2.7).
 
-The block is ë(t) = -K_1 e(t - τ) - K_2 ė(t - τ) - K_i q(t - τ), q̇ = e.  Cut open, its frequency response is
+The block is ë(t) = -K_1 e(t - τ) - K_2 ė(t - τ) - K_i q(t - τ), q̇ = e.  Its loop, cut open, has the
+frequency response
 
     L(jω) e^{-jωτ},   L(jω) = (K_1 + jω K_2 + K_i/(jω))/ω²
 
@@ -20,11 +21,12 @@ from echelon.controller.prediction.gains import poles
 from echelon.plan.plan import Array
 
 SLOW: Final = 1e-3
-"""Crossings are looked for from this share of the slowest pole on"""
+"""Crossings are searched from this multiple of the slowest pole's magnitude upwards"""
 
 
 def delay_margin(gains: LinearGains) -> float | None:
-    """Returns the largest delay τ* [s] that a block bears; None if it is unstable even without any."""
+    """Returns the delay margin τ* of a block [s]: it is stable for delays below it.  Returns None if it is unstable without
+    delay."""
     K_1, K_2, K_i = gains.K_1, gains.K_2, gains.K_i
     found = poles(gains)
     if found.real.max() >= 0:
@@ -35,5 +37,6 @@ def delay_margin(gains: LinearGains) -> float | None:
         loop = np.asarray((K_1 + 1j * w * K_2 + K_i / (1j * w)) / w**2, dtype=np.complex128)
         return np.asarray(np.linalg.eigvals(loop), dtype=np.complex128)
 
+    # At frequencies above `high` |λ| ≤ ‖L‖ < 1, so there are no crossings.
     high = sum(np.linalg.norm(matrix, 2) ** power for matrix, power in ((K_1, 1 / 2), (K_2, 1), (K_i, 1 / 3)))
-    return smallest_delay(crossings(eigenvalues, SLOW * np.abs(found).min(), float(high)))  # beyond it |λ| ≤ ‖L‖ < 1
+    return smallest_delay(crossings(eigenvalues, SLOW * np.abs(found).min(), float(high)))

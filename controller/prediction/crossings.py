@@ -5,9 +5,9 @@ has a root s = jω where some eigenvalue λ of L(jω) has λ e^{-jωτ} = 1: at 
 
     τ = (arg λ + 2π m)/ω,   m = 0, 1, 2, …
 
-As τ grows beyond that, the root leaves the stable side if |λ| falls with ω, and comes back to it if |λ| rises (differentiate
-λ(s) e^{-sτ} = 1 for τ).  So a loop that is stable for τ = 0 is stable up to the smallest such τ.  The same holds for sampled
-loops, with z = e^{jω} and delays of whole samples.
+As τ grows beyond such a delay, the root leaves the stable side if |λ| falls with ω, and comes back to it if |λ| rises
+(differentiate λ(s) e^{-sτ} = 1 with respect to τ).  So a loop that is stable for τ = 0 is stable up to the smallest such τ.
+The same holds for sampled loops, with z = e^{jω} and delays of whole samples.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,18 +21,19 @@ from scipy.optimize import brentq, minimize_scalar
 from echelon.plan.plan import Array
 
 Eigenvalues = Callable[[Array], NDArray[np.complex128]]
-"""Frequencies ω, (m,) → eigenvalues of the loop at them, (m, n)"""
+"""A function from frequencies ω, (m,), to the n eigenvalues of the loop at each, (m, n)"""
 
 PER_DECADE: Final = 120
-"""Frequencies that are looked at"""
+"""Number of frequencies per decade at which the eigenvalues are computed"""
 NEAR: Final = 0.05
-"""Where log|λ| turns back so near to 0, it is looked at more closely: two crossings may hide between two frequencies"""
+"""Where log|λ| has an extremum within this distance from 0, a finer search follows: two crossings may lie between two
+frequencies"""
 SAME: Final = 1e-6
-"""Eigenvalues with log|λ| as near to 0 as this cross together"""
+"""Eigenvalues with |log|λ|| below this lie on the unit circle"""
 
 
 class Crossing(NamedTuple):
-    """An eigenvalue λ on the unit circle: its frequency ω, arg λ from 0 to 2π, and whether |λ| falls with ω."""
+    """An eigenvalue λ on the unit circle: its frequency ω, arg λ in [0, 2π), and whether |λ| falls with ω."""
 
     omega: float
     angle: float
@@ -40,7 +41,7 @@ class Crossing(NamedTuple):
 
 
 def crossings(eigenvalues: Eigenvalues, low: float, high: float) -> list[Crossing]:
-    """Returns where eigenvalues cross the unit circle between two frequencies."""
+    """Returns the crossings of the unit circle between the frequencies `low` and `high`."""
     omegas = np.geomspace(low, high, max(3, round(PER_DECADE * np.log10(high / low))))
     logs = _logs(eigenvalues(omegas))
     found: list[tuple[float, bool]] = []
@@ -60,12 +61,13 @@ def crossings(eigenvalues: Eigenvalues, low: float, high: float) -> list[Crossin
 
 
 def smallest_delay(found: list[Crossing]) -> float:
-    """Returns the smallest delay for which a root lies on the edge, in units of 1/ω; infinite if there is none."""
+    """Returns the smallest delay for which a root lies on the edge of stability, in units of 1/ω; infinite without
+    crossings."""
     return min((crossing.angle / crossing.omega for crossing in found), default=inf)
 
 
 def unstable_roots(found: list[Crossing], delay: float) -> int:
-    """Returns how many pairs of roots have crossed the edge for a delay, if the loop without it is stable."""
+    """Returns the number of pairs of unstable roots for a delay, if the loop without delay is stable."""
     return sum(
         (1 if crossing.falls else -1) * max(0, floor((delay * crossing.omega - crossing.angle) / (2 * pi)) + 1)
         for crossing in found
@@ -73,7 +75,8 @@ def unstable_roots(found: list[Crossing], delay: float) -> int:
 
 
 def _brackets(eigenvalues: Eigenvalues, omegas: Array, logs: Array) -> Iterator[tuple[float, float, int, bool]]:
-    """Yields frequencies between which the magnitude number `column` crosses 1, and whether it falls there."""
+    """Yields pairs of frequencies between which an eigenvalue crosses the unit circle: left, right, its number in the order of
+    magnitudes (0 is the largest), and whether its magnitude falls there.  `logs` are log|λ| at `omegas`, (m, n)."""
     above = logs >= 0
     for row, column in zip(*np.nonzero(above[:-1] != above[1:]), strict=True):
         yield omegas[row], omegas[row + 1], column, above[row, column]
@@ -102,4 +105,5 @@ def _logs(values: NDArray[np.complex128]) -> Array:
 
 
 def _log(eigenvalues: Eigenvalues, omega: float, column: int) -> float:
+    """Returns log|λ| of the eigenvalue with this number in the order of magnitudes."""
     return float(_logs(eigenvalues(np.array([omega])))[0, column])

@@ -1,4 +1,4 @@
-"""The gains of a plan's law, where it is linear, and the block alone in continuous time that they make."""
+"""The gains of a plan's law, if it is linear, and the poles of a block alone with these gains."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ from echelon.plan.plan import BlockPlan, Plan
 
 
 class PredictionError(ValueError):
-    """A run of which nothing exact can be said; the text says why."""
+    """No exact prediction is possible for a run; the text says why."""
 
 
 def linear_gains(plan: Plan, block: BlockPlan, lead: float | None = None) -> LinearGains:
-    """Returns the gains of a block as they act; with `lead` [periods] instead of the plan's, if given.
+    """Returns the gains of a block as they act, with the plan's `lead`, or with the given one [periods].
 
     Raises PredictionError if the plan's law is not linear."""
     law: Law = plan.law.made

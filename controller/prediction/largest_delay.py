@@ -1,19 +1,19 @@
 """How much later all messages of a channel may be before the run near its formation is unstable (docs/architecture.md, 2.7).
 
-All links of the channel get the same delay more, beyond what they have.  It acts in ticks: a message is used at instants of its
-receiver, and said at instants of its source.
+The same extra delay is added to all links of the channel.  It acts in whole ticks, since messages are sent and used at
+multiples of periods only.
 
-*One period for all.*  The linear run is cut open where the channel is said (`LinearRun.loop`).  From what is handed over to
-what is said it is
+*If all periods are equal*, the linear run is cut open where the messages of the channel are sent (`LinearRun.loop`).  From the
+messages that receivers get, to the messages that are sent, its transfer matrix is
 
     R(z) = C (z - A)⁻¹ B + D
 
-so with k ticks more it has the roots of det(I - z^{-k} R(z)) = 0.  `controller.prediction.crossings` says for which k the first
-of them reaches the unit circle: no delay is tried out, and none is left out, however large it is.  This takes k as continuous,
-which is sound where the eigenvalues of R(-1) are smaller than 1.  What it finds is confirmed by the map with one tick less and
-with just as many, unless that is larger than `CONFIRMED`.
+so with k extra ticks the roots are those of det(I - z^{-k} R(z)) = 0.  `controller.prediction.crossings` gives the k for which
+the first root reaches the unit circle, without trying one delay after the other, so that no delay is too large.  This takes k
+as continuous, which is valid if the eigenvalues of R(-1) are smaller than 1.  The result is confirmed by the maps for k and for
+k - 1 ticks, unless they are larger than `CONFIRMED`.
 
-*Otherwise* one delay after the other is tried out, up to `TRIED` ticks.
+*Otherwise* one delay after the other is tried, up to `TRIED` ticks.
 """
 
 from collections.abc import Iterator
@@ -35,17 +35,17 @@ from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Array, Plan
 
 TRIED: Final = 50
-"""Ticks up to which delays are tried out"""
+"""Largest delay that is tried [ticks]"""
 CONFIRMED: Final = 800
-"""Largest map that confirms what was found in another way"""
+"""Size of the largest map that is computed to confirm a result"""
 SLOW: Final = 1e-3
-"""Crossings are looked for from this share of the slowest block's natural frequency on"""
+"""Crossings are searched from this multiple of the slowest block's natural frequency upwards"""
 SMALL: Final = 150
-"""Up to this size equations are solved as dense ones"""
+"""Number of unknowns up to which equations are solved with dense matrices"""
 RANK: Final = 1e-12
-"""Singular values below this share of the largest are zero"""
+"""Singular values below this share of the largest one count as zero"""
 _TOGETHER: Final = 32
-"""Frequencies that are computed at once"""
+"""Number of frequencies that are computed at once"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +53,23 @@ class LargestDelay:
     """How much later the messages of a channel may be."""
 
     tick_s: float
+    """Length of a tick [s]"""
     ticks: int | None
-    """Every additional delay of 0 to `ticks` ticks is stable; None: not even 0 is"""
+    """Every extra delay of 0 to `ticks` ticks is stable; None: even without extra delay the run is unstable"""
     ends: Literal["unstable", "timeout", "limit"]
-    """Why it is not more: one tick more is unstable, or older than a link's timeout allows, or has not been tried out"""
+    """Why it is not more.  One tick more is unstable, or makes messages older than the timeout of a link, or was not tried"""
 
     @property
     def seconds(self) -> float | None:
-        """The same in seconds."""
+        """`ticks` in seconds."""
         return None if self.ticks is None else self.ticks * self.tick_s
 
 
 def largest_extra_delay(plan: Plan, channel: Channel) -> LargestDelay:
-    """Returns how much later all messages of a channel may be, in a plan whose links have constant delays and lose nothing.
+    """Returns how much later all messages of a channel may be, in a plan whose links have constant delays and lose no messages.
 
-    Raises PredictionError if nothing exact can be said of the plan as it is, ValueError if it has no such link."""
+    Raises PredictionError if no exact prediction is possible for the plan itself, and ValueError if the channel has no
+    links."""
     links = ruled_links(plan, channel)
     if not links:
         raise ValueError(f"channel {channel.name.lower()}: there is no link of it")
@@ -91,8 +93,9 @@ def largest_extra_delay(plan: Plan, channel: Channel) -> LargestDelay:
 
 
 def _first_unstable(run: LinearRun, channel: Channel) -> int | None:
-    """Returns the smallest unstable k of a run that is stable for k = 0; None if the criterion does not hold, or if the map
-    says otherwise."""
+    """Returns the smallest number of extra ticks k for which a run is unstable that is stable for k = 0.
+
+    Returns None if the criterion is not valid for the run, finds no such k, or is not confirmed by the maps."""
     plan = run.plan
     stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
     slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
@@ -116,12 +119,13 @@ def _first_unstable(run: LinearRun, channel: Channel) -> int | None:
 
 
 def _patient(plan: Plan) -> Plan:
-    """Returns a plan whose links have no timeout."""
+    """Returns the plan with links without timeouts."""
     return replace(plan, links=tuple(replace(link, timeout_ns=NEVER_NS) for link in plan.links))
 
 
 def _parts(loop: Loop) -> Iterator[Eigenvalues]:
-    """Yields the eigenvalues of R(e^{jω}) for parts of the run that act on each other, each different part once."""
+    """Yields the eigenvalues of R(e^{jω}) as functions of ω, for each part of the run whose variables act on each other.  Equal
+    parts are yielded once."""
     size = loop.A.shape[0]
     seen = set()
     for rows in strong_parts(csr_array(block_array([[loop.A, loop.B], [loop.C, loop.D]]))):
@@ -136,8 +140,8 @@ def _parts(loop: Loop) -> Iterator[Eigenvalues]:
 def _eigenvalues(part: Loop) -> Eigenvalues:
     """Returns the eigenvalues of R(e^{jω}) as a function of ω.
 
-    What is handed over acts through few combinations, (B; D) = F V: V R' with R' = (C (z - A)⁻¹, 1) F has the same eigenvalues,
-    most zeros left out."""
+    The messages that receivers get act through few combinations, (B; D) = F V with a V of few rows.  So R has the eigenvalues
+    of the smaller matrix V (C (z - A)⁻¹, 1) F; the others are zero."""
     size = part.A.shape[0]
     left, strengths, V = np.linalg.svd(np.vstack([part.B.toarray(), part.D.toarray()]), full_matrices=False)
     rank = int((strengths > RANK * strengths.max()).sum())

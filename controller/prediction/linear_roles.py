@@ -1,7 +1,7 @@
-"""Robots and nodes of the linear run (`controller.prediction.linear_run`): roles whose stages take matrices.
+"""Robots and nodes of the linear run (`controller.prediction.linear_run`): roles whose messages are matrices.
 
-A column of such a matrix is one run.  Positions are relative to the desired motion, so the trajectory and the shapes that nodes
-want are zero, and nothing is constant.
+Each column of such a matrix belongs to another run; all runs are computed at once.  Positions are relative to the desired
+motion.  So the desired trajectory and the desired shapes are zero, and all stages are linear without constant terms.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,28 +21,29 @@ from echelon.plan.plan import Array, NodePlan, Plan, RobotPlan
 from echelon.runtime.turns import Turn, level
 
 MOTION: Final = (0, 0, 1, 1)
-"""Of (x, y, vx, vy) the power of 1/s: a length has 0, a velocity 1, an acceleration 2, an integral of a length -1"""
+"""The powers of 1/s in the units of (x, y, vx, vy).  A length has 0, a velocity 1, an acceleration 2, the integral of a length
+-1"""
 
 Said = dict[Channel, Array]
-"""What a stage says, by channel"""
+"""The messages that a stage sends, by channel; each is (numbers in the message, runs)"""
 
 
 @dataclass(frozen=True, slots=True)
 class LinearStage:
-    """A stage: at multiples of `period_ns`, `run` with what was heard for each of `inputs`."""
+    """A stage: at multiples of `period_ns`, `run` is called with the message of each of `inputs`."""
 
     level: int
-    """Its place in the order of an instant"""
+    """Place in the order of the stages of one instant"""
     period_ns: int
     source: int
-    """Whose it is"""
+    """Index of the role"""
     inputs: tuple[tuple[int, int, Channel], ...]
-    """Source, receiver and channel of the links that it hears"""
+    """Source, receiver and channel of the links whose messages it uses"""
     run: Callable[[Sequence[Array]], Said]
 
 
 def powers_of(plan: Plan, source: int, channel: Channel) -> tuple[int, ...]:
-    """Returns of each number in a message the power of 1/s."""
+    """Returns for each number in a message the power of 1/s in its unit."""
     if channel is Channel.STATE:
         return MOTION
     if channel is Channel.TORQUE:
@@ -57,9 +58,9 @@ def powers_of(plan: Plan, source: int, channel: Channel) -> tuple[int, ...]:
 
 
 class LinearRobot:
-    """A double integrator under the acceleration that it holds.
+    """A robot as a double integrator: it moves under the acceleration of its last command.
 
-    Where the torque path is closed, it asks in each torque period, and what it asks goes over the link of its torques."""
+    On a closed torque path it asks for this acceleration in each torque period, in a message over the link of its torques."""
 
     def __init__(self, plan: Plan, robot: RobotPlan) -> None:
         self.powers = MOTION
@@ -97,7 +98,7 @@ class LinearRobot:
 
 
 class LinearNode:
-    """A node of the tree: it does what `controller.node.TreeNode` does."""
+    """A node of the tree; it computes the same as `controller.node.TreeNode`."""
 
     def __init__(self, plan: Plan, node: NodePlan) -> None:
         """Raises PredictionError if the plan's law is not linear."""
@@ -107,7 +108,7 @@ class LinearNode:
         size = 0 if self._blocks is None else self._blocks.size
         self.powers = (-1,) * size
         self.memory: Array = np.zeros((size, 0))
-        """q of the law's integral action"""
+        """The integrals q of the law's integral action"""
         self._s: Array = np.zeros((0, 0))
         self._state: Array = np.zeros((0, 0))
         index, robots = node.index, len(plan.robots)
@@ -122,7 +123,7 @@ class LinearNode:
         )
 
     def _gather(self, heard: Sequence[Array]) -> Said:
-        """Takes the children's states; returns the group's."""
+        """Takes the children's states; returns the group's state for the parent, nothing at the root."""
         self._s = s = np.vstack([values[CENTROID] for values in heard])
         own, layout = self._law.up @ s, self._layout.state
         self._state = state = np.empty((layout.size, s.shape[1]))
@@ -157,7 +158,7 @@ class LinearNode:
 
 
 class _LinearBlocks:
-    """The blocks of a node under a law that is linear, but not all matrices (`controller.laws.in_tree.NodeBlocks`)."""
+    """The blocks of a node under a linear law that nodes call block by block, like `controller.laws.in_tree.NodeBlocks`."""
 
     def __init__(self, plan: Plan, node: NodePlan) -> None:
         blocks = [plan.block_of(node.index), *plan.blocks[-1:]] if node.parent is None else [plan.block_of(node.index)]
@@ -165,12 +166,14 @@ class _LinearBlocks:
         self._K_1, self._K_2, self._K_i = (
             block_diag(*(getattr(each, name) for each in gains)) for name in ("K_1", "K_2", "K_i")
         )
-        # A part of q that acts on nothing would never settle.
+        # A component of q without effect would keep its value for ever: an eigenvalue of 1 that says nothing about the run.
         self._uses_q = np.any(self._K_i, axis=0, keepdims=True).T
         self.size = len(self._K_1)
         phi = node_matrix(node.weights)
         self._back = np.kron(np.linalg.inv(phi), np.eye(2))[:, : self.size]
-        errors = np.kron(phi, np.eye(4)).reshape(len(phi), 2, 2, -1)  # of s: variable, order of the derivative, axis
+        errors = np.kron(phi, np.eye(4)).reshape(
+            len(phi), 2, 2, -1
+        )  # axes: variable, order of the derivative, x or y, then s
         self._e = errors[:, 0].reshape(2 * len(phi), -1)[: self.size]
         self._e_dot = errors[:, 1].reshape(2 * len(phi), -1)[: self.size]
         self._T = node.period_ns * 1e-9

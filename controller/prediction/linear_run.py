@@ -3,17 +3,17 @@
 Near the formation, with avoidance silent and torques that do what accelerations ask, a run is linear in its errors:
 
 - a robot is a double integrator under the acceleration a that it holds: p⁺ = p + T v + T²/2 a, v⁺ = v + T a;
-- a node is the matrices of `controller.node.NodeLaw`, and integral action within its bounds where the law has it;
-- a link with the constant delay d, whose messages are said every P, hands over number ⌊(t - d)/P⌋ at t, as
+- a node multiplies by the matrices of `controller.node.NodeLaw`; if the law has integral action, it stays within its bounds;
+- a link with the constant delay d, whose messages are sent with the period P, delivers message number ⌊(t - d)/P⌋ at t, as
   `echelon.runtime.link` does.
 
-All periods divide that of the root, the *hyperperiod* H.  The state x at its beginning is (p, v) of all robots, the integrals q
-of nodes whose law has them, and the messages on their way.  Unit vectors of x go through all stages of one hyperperiod, in the
-order of their turns (`echelon.runtime.turns`):
+All periods divide that of the root, the *hyperperiod* H.  The state x at the beginning of a hyperperiod consists of (p, v) of
+all robots, the integrals q of nodes whose law has them, and the messages on their way.  M is found by taking unit vectors of x
+through all stages of one hyperperiod, in the order of their turns (`echelon.runtime.turns`):
 
     x⁺ = M x
 
-Time is counted in hyperperiods, so x has (p, H v, H² a, q/H) and the numbers in M are of one size whatever the periods.
+Time is counted in hyperperiods: x contains (p, H v, H² a, q/H), so the numbers in M are of similar size whatever the periods.
 """
 
 from collections.abc import Sequence
@@ -22,22 +22,23 @@ from math import gcd
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, powers_of
+from echelon.controller.prediction.unit_vectors import Columns, Rows
 from echelon.messages import Channel
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, LinkPlan, Plan
 
 CHANNELS: Final = (Channel.STATE, Channel.GROUP_STATE, Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
-"""Of the links that a scenario's rules are about; the others stand for shafts and buses"""
+"""The channels to which the rules in a scenario's `links` apply; links of other channels stand for shafts and buses"""
 
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """The linear run, cut open where one channel is said.  y is what is said there in a hyperperiod, and u what is handed over
-    as if it had been said in this hyperperiod:
+    """The linear run, cut open where the messages of one channel are sent.  y are the messages that are sent in a hyperperiod,
+    u are the messages that links take in their place:
 
         x⁺ = A x + B u,   y = C x + D u
     """
@@ -49,12 +50,12 @@ class Loop:
 
 
 def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
-    """Returns the links that are no part of a linear map: their messages are lost at times, or take different times."""
+    """Returns the links that a linear map cannot describe: they lose messages, or their delays vary."""
     return tuple(link for link in plan.links if link.loss > 0 or link.delay_min_ns != link.delay_max_ns)
 
 
 def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:
-    """Returns a plan in which all messages of a channel of `CHANNELS` take longer."""
+    """Returns the plan with `extra_ns` added to the delays of all links of a channel of `CHANNELS`."""
 
     def longer(link: LinkPlan) -> LinkPlan:
         if link.channel is not channel or not _is_ruled(plan, link):
@@ -65,24 +66,25 @@ def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:
 
 
 def ruled_links(plan: Plan, channel: Channel) -> list[LinkPlan]:
-    """Returns the links of a channel of `CHANNELS` that a scenario's rules are about."""
+    """Returns the links of a channel of `CHANNELS` to which the rules of a scenario apply."""
     return [link for link in plan.links if link.channel is channel and _is_ruled(plan, link)]
 
 
 def _is_ruled(plan: Plan, link: LinkPlan) -> bool:
-    """False for the torques that the drives are told: they stand for the bus, and are never late."""
+    """Returns whether the rules of a scenario apply to a link; not to torques for the drives: they stand for the bus, without
+    delay."""
     return link.channel in CHANNELS and (plan.drives is None or link.receiver != plan.drives.index)
 
 
 class LinearRun:
-    """The linear run of a plan whose links have constant delays and lose nothing.
+    """The linear run of a plan whose links have constant delays and lose no messages.
 
-    Left out, for they are not linear: avoidance, limits of torque and speed, how a robot turns, and, where the torque path is
-    closed, what buses and drives do."""
+    It leaves out what is not linear: avoidance, limits of torque and speed, the robots' headings, and on a closed torque path
+    buses and drives."""
 
     def __init__(self, plan: Plan) -> None:
-        """Raises PredictionError if the law is not linear, a link is not constant, or messages are older than their link's
-        timeout when they would be used."""
+        """Raises PredictionError if the law is not linear, if a link loses messages or has varying delays, or if messages are
+        older than their link's timeout when they would be used."""
         if found := untreated(plan):
             raise PredictionError(f"{len(found)} of {len(plan.links)} links lose messages or have delays that vary")
         self.plan = plan = with_message_sizes(replace(plan, avoidance=replace(plan.avoidance, enabled=False)))
@@ -96,7 +98,7 @@ class LinearRun:
         self._places: list[int] = []
         """Where in x the memory of each role begins"""
         self.size = 0
-        """Of x"""
+        """Number of components of x"""
         for role in self._roles:
             self._places.append(self.size)
             self.size += len(role.powers)
@@ -105,7 +107,7 @@ class LinearRun:
             self.size += wire.on_way * wire.size
 
     def periods(self, channel: Channel | None = None) -> set[int]:
-        """Returns the periods of all stages [ns], or of those that hear a channel."""
+        """Returns the periods of all stages [ns], or of the stages that use messages of a channel."""
         return {
             stage.period_ns
             for stage in self._stages
@@ -117,15 +119,15 @@ class LinearRun:
         return self._through(None).A
 
     def loop(self, channel: Channel) -> Loop:
-        """Returns the linear run, cut open where a channel is said."""
+        """Returns the linear run, cut open where the messages of a channel are sent."""
         return self._through(channel)
 
     def _units(self, powers: Sequence[int]) -> Array:
-        """Returns H to the powers of time of some numbers."""
+        """Returns H to these powers: the factors that turn numbers in SI units into components of x."""
         return (self.hyperperiod_ns * 1e-9) ** np.array(powers, dtype=float)
 
     def _make_wires(self) -> "dict[tuple[int, Channel], _Wire]":
-        """Returns the wires of all that is heard, by source and channel."""
+        """Returns the wires of all messages that are used, by source and channel."""
         plan, names = self.plan, [one.name for one in self.plan.all_roles]
         links = {(link.source, link.receiver, link.channel): link for link in plan.links}
         wires: dict[tuple[int, Channel], _Wire] = {}
@@ -147,8 +149,8 @@ class LinearRun:
         return wires
 
     def _through(self, cut: Channel | None) -> Loop:
-        """Takes unit vectors through one hyperperiod."""
-        hyperperiod_ns, wires, columns = self.hyperperiod_ns, self._wires, _Columns()
+        """Takes unit vectors through one hyperperiod; returns the linear run, cut open at channel `cut` if it is given."""
+        hyperperiod_ns, wires, columns = self.hyperperiod_ns, self._wires, Columns()
         units = [self._units(role.powers) for role in self._roles]
         memories = [columns.of_x(at, unit) for at, unit in zip(self._places, units, strict=True)]
         old = {
@@ -184,18 +186,18 @@ class LinearRun:
                         if (wire, number) not in given:
                             wire.said[number] = values
 
-        rows = _Rows(columns)
+        rows = Rows(columns)
         for role, at, unit in zip(self._roles, self._places, units, strict=True):
             rows.add(at, unit[:, None] * role.memory)
         for wire in wires.values():
             for number in range(-wire.on_way, 0):
-                now = number + hyperperiod_ns // wire.period_ns  # as it is numbered in the hyperperiod that ends
+                now = number + hyperperiod_ns // wire.period_ns  # its number as counted in the hyperperiod that ends
                 if now in wire.said:
                     rows.add(wire.place(number), wire.unit[:, None] * wire.said[now])
                 else:
                     rows.move(wire.place(number), wire.place(now), wire.size)
         A, B = rows.matrices(self.size, self.size)
-        out, at = _Rows(columns), 0
+        out, at = Rows(columns), 0
         for wire, number in given:
             out.add(at, wire.unit[:, None] * said[wire, number])
             at += wire.size
@@ -204,98 +206,32 @@ class LinearRun:
 
 
 class _Wire:
-    """All that one source says on one channel."""
+    """The messages of one source on one channel.  Message number 0 is sent at time 0, the beginning of the hyperperiod."""
 
     def __init__(self, period_ns: int, unit: Array) -> None:
         self.period_ns, self.unit, self.size = period_ns, unit, len(unit)
         self.delay_ns: dict[int, int] = {}
-        """By receiver"""
+        """Delay of the link by receiver"""
         self.used: set[int] = set()
-        """Numbers of the messages that are used in the hyperperiod from 0 on; number 0 is said at 0"""
+        """Numbers of the messages that are used in the hyperperiod"""
         self.at = 0
-        """Where the messages on their way stand in x, the oldest first"""
+        """Where in x the messages on their way begin, the oldest first"""
         self.said: dict[int, Array] = {}
+        """Messages by number"""
 
     @property
     def on_way(self) -> int:
-        """How many messages that were said before 0 are used at 0 or later."""
+        """Number of messages that are sent before 0 and used at 0 or later."""
         return max(-(-delay_ns // self.period_ns) for delay_ns in self.delay_ns.values())
 
     def number(self, receiver: int, time_ns: int) -> int:
-        """Returns which message a receiver uses at an instant."""
+        """Returns the number of the message that a receiver uses at an instant."""
         return (time_ns - self.delay_ns[receiver]) // self.period_ns
 
     def heard(self, receiver: int, time_ns: int) -> Array:
-        """Returns what a receiver uses at an instant."""
+        """Returns the message that a receiver uses at an instant."""
         return self.said[self.number(receiver, time_ns)]
 
     def place(self, number: int) -> int:
-        """Returns where a message that was said before 0 begins in x."""
+        """Returns where in x a message begins that was sent before 0."""
         return self.at + (self.on_way + number) * self.size
-
-
-class _Columns:
-    """The unit vectors that are taken through: those of x that the hyperperiod uses, then those of u."""
-
-    def __init__(self) -> None:
-        self.x: list[int] = []
-        """Where in x each of the first columns stands"""
-        self.u = 0
-        """How many are of u"""
-
-    def of_x(self, at: int, unit: Array) -> tuple[int, Array]:
-        """Adds the columns of what stands at a place in x; they come before all of u."""
-        self.x.extend(range(at, at + len(unit)))
-        return len(self.x) - len(unit), unit
-
-    def of_u(self, unit: Array) -> tuple[int, Array]:
-        """Adds columns of u."""
-        self.u += len(unit)
-        return len(self.x) + self.u - len(unit), unit
-
-    def unit_vectors(self, seed: tuple[int, Array]) -> Array:
-        """Returns what stands at added columns as a matrix over all of them, in SI units."""
-        at, unit = seed
-        matrix = np.zeros((len(unit), len(self.x) + self.u))
-        matrix[np.arange(len(unit)), at + np.arange(len(unit))] = 1 / unit
-        return matrix
-
-
-class _Rows:
-    """Rows of a matrix over x and u, as they are found."""
-
-    def __init__(self, columns: _Columns) -> None:
-        self._columns = columns
-        self._found: list[tuple[int, Array]] = []
-        self._moved: list[tuple[int, int]] = []
-
-    def add(self, at: int, values: Array) -> None:
-        """Adds rows over the columns, the first of them number `at`."""
-        self._found.append((at, values))
-
-    def move(self, at: int, source: int, size: int) -> None:
-        """Adds rows that are what stands at `source` in x."""
-        self._moved += [(at + each, source + each) for each in range(size)]
-
-    def matrices(self, rows: int, size: int) -> tuple[csr_array, csr_array]:
-        """Returns the rows over x and over u."""
-        count = len(self._columns.x)
-        stacked = (
-            np.vstack([values for _, values in self._found]) if self._found else np.zeros((0, count + self._columns.u))
-        )
-        at = np.concatenate([start + np.arange(len(values)) for start, values in self._found] or [np.zeros(0, int)])
-        one, two = stacked.nonzero()
-        is_x = two < count
-        moved = np.array(self._moved, dtype=int).reshape(-1, 2)
-        x = np.array(self._columns.x, dtype=int)
-        over_x = coo_array(
-            (
-                np.concatenate([stacked[one[is_x], two[is_x]], np.ones(len(moved))]),
-                (np.concatenate([at[one[is_x]], moved[:, 0]]), np.concatenate([x[two[is_x]], moved[:, 1]])),
-            ),
-            (rows, size),
-        )
-        over_u = coo_array(
-            (stacked[one[~is_x], two[~is_x]], (at[one[~is_x]], two[~is_x] - count)), (rows, self._columns.u)
-        )
-        return over_x.tocsr(), over_u.tocsr()

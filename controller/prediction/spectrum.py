@@ -1,4 +1,4 @@
-"""Spectral radius of a large, sparse map: of its parts that act on each other, and of those only the outermost eigenvalues."""
+"""The spectral radius of a large, sparse matrix: part by part, and for large parts from the outermost eigenvalues only."""
 
 from math import inf
 from typing import Final
@@ -13,22 +13,23 @@ from scipy.sparse.linalg import ArpackNoConvergence, eigs
 from echelon.controller.prediction.gains import PredictionError
 
 DENSE: Final = 600
-"""Up to this size all eigenvalues of a part are computed"""
+"""Size up to which all eigenvalues of a part are computed"""
 LARGE: Final = 2000
-"""Up to this size all of them are computed where the outermost do not converge"""
+"""Size up to which all eigenvalues are computed if the outermost ones do not converge"""
 LARGEST: Final = 6000
-"""A part that is larger is refused"""
+"""Size of the largest part; a larger one is refused"""
 OUTERMOST: Final = 8
+"""Number of outermost eigenvalues that are computed"""
 VECTORS: Final = 120
-"""Of the Krylov space: many, for eigenvalues that come of delays lie close together"""
+"""Dimension of the Krylov space; it is large, since eigenvalues that come from delays lie close together"""
 STARTS: Final = 2
-"""From a single vector, one of several eigenvalues of nearly the same magnitude may be missed"""
+"""Number of starting vectors; with a single one, one of several eigenvalues of nearly the same magnitude may be missed"""
 
 
 def spectral_radius(matrix: csr_array) -> float:
-    """Returns the largest magnitude of an eigenvalue; infinite if some number is not finite.
+    """Returns the largest magnitude of the eigenvalues of a square matrix; infinite if a number in it is not finite.
 
-    Raises PredictionError if the map is too large."""
+    Raises PredictionError if a part of the matrix is too large."""
     if not np.isfinite(matrix.data).all():
         return inf
     different = {}
@@ -40,14 +41,16 @@ def spectral_radius(matrix: csr_array) -> float:
 
 
 def strong_parts(matrix: csr_array) -> list[NDArray[np.intp]]:
-    """Returns the variables of each part: those that act on each other, be it by way of others.  Ordered by parts, the matrix
-    is block triangular, so its spectrum is that of the parts."""
+    """Returns the indices of the variables in each part.  Variables are in the same part if each acts on the other, directly or
+    through others (strongly connected components).  Ordered by parts the matrix is block triangular, so its spectrum is that of
+    the parts."""
     count, label = connected_components(matrix, directed=True, connection="strong")
     order = np.argsort(label, kind="stable")
     return np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1])
 
 
 def _radius(part: csr_array) -> float:
+    """Returns the spectral radius of a part."""
     size = part.shape[0]
     if size <= DENSE:
         return float(np.abs(eigvals(part.toarray())).max())

@@ -1,25 +1,33 @@
-"""The command `echelon`, at the top of the house: it imports what it needs, and nothing imports it.
+"""The command `echelon`.  It may import every other folder of the package; no other folder imports it.
 
-`parser` knows all commands; each family of them has a file: `run`, `scenario`, `results`, `bus`, `machine`.  Those are
-cheap to import, so that `--help` is there at once; a command imports what it works with when it is called.
+`parser` has the list of commands.  The commands are defined in `run`, `scenario`, `results`, `bus` and `machine`.  These
+modules are cheap to import, so that `--help` answers at once; a command imports what it works with only when it is called.
 """
 
 import os
 import sys
 from collections.abc import Sequence
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy reads it when it is loaded: its threads would only wait
+os.environ.setdefault(
+    "OPENBLAS_NUM_THREADS", "1"
+)  # before numpy is imported: for small matrices its threads only cost time
 
 from echelon.errors import PartRunError, UserError, one_line
 
 DEBUG = "ECHELON_DEBUG"
-"""Set to 1 in the environment, it is as if `--debug` were given."""
+"""Environment variable: set to 1, it does the same as the option `--debug`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; returns its exit code.
+    """Runs the command with these arguments, by default those of the process; returns its exit code.
 
-    0: done, and the verdict holds; 1: the verdict fails; 2: a mistake of the user's; 3: it could not be done."""
+    code  meaning
+    0     done, and the verdict does not fail
+    1     done, and the verdict fails
+    2     a mistake of the user
+    3     it could not be done, or not to its end
+
+    An error is one line on standard error.  Ends the process for `--help` and for wrong arguments, as argparse does."""
     debug = os.environ.get(DEBUG, "") not in ("", "0")
     try:
         from echelon.cli.parser import read
@@ -27,16 +35,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         call = read(arguments)
         debug = debug or call.debug
         code = call.work()
-        print(end="", flush=True)  # while what goes wrong with it can still be told
+        print(end="", flush=True)  # here, so that an error of it is caught below
         return code
     except UserError as error:
-        if debug and error.__cause__ is not None:  # what a user's part raised
+        if debug and error.__cause__ is not None:  # the exception that a user's part raised
             import traceback
 
             traceback.print_exception(error.__cause__)
         print(f"echelon: {error}", file=sys.stderr)
         return 3 if isinstance(error, PartRunError) else 2
-    except BrokenPipeError:  # a reader such as head that has seen enough
+    except BrokenPipeError:  # the reader of the output has ended, for example `head`
         _drop_output()
         return 0
     except KeyboardInterrupt:
@@ -48,21 +56,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             traceback.print_exc()
         else:
-            print(_told(error), file=sys.stderr)
+            print(_error_line(error), file=sys.stderr)
         try:
             print(end="", flush=True)
-        except OSError:  # which was the error: the interpreter must not try once more when it ends
+        except OSError:  # the output cannot be written; the interpreter would try again when it ends
             _drop_output()
         return 3
 
 
 def _drop_output() -> None:
-    """Sends what is left of the output nowhere."""
+    """Discards the output that is not written yet."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
-def _told(error: Exception) -> str:
-    """Returns what is said of an error that nobody expected: what, where, and how to see more, on one line."""
+def _error_line(error: Exception) -> str:
+    """Returns one line about an unexpected error: what it is, where it was raised, and how to see the traceback."""
     import traceback
 
     place = traceback.extract_tb(error.__traceback__)[-1]

@@ -1,4 +1,4 @@
-"""`echelon analyse`: whether a scenario's formation settles, and how much later messages may be, without running it."""
+"""The command `echelon analyse`: computes, without a run, whether a formation settles and how much delay it tolerates."""
 
 import json
 from collections.abc import Sequence
@@ -22,7 +22,9 @@ class AnalyseOptions(ScenarioOptions):
 
 
 def analyse(options: AnalyseOptions) -> int:
-    """Computes whether the formation settles and how much delay it bears; 1 if it does not settle."""
+    """Computes whether the formation settles and how much delay it tolerates.
+
+    Returns exit code 1 if it does not settle, or if the torque loop of a robot diverges."""
     from echelon.cli.scenario_file import read_scenario
     from echelon.controller.prediction.analysis import analyse as analysis_of
     from echelon.controller.prediction.gains import PredictionError
@@ -32,7 +34,7 @@ def analyse(options: AnalyseOptions) -> int:
     try:
         found = analysis_of(plan)
     except PredictionError as error:
-        raise UsageError(f"{options.scenario}: cannot be analysed, only run: {error}") from None
+        raise UsageError(f"{options.scenario}: cannot be analysed; run it instead: {error}") from None
     asked = asked_of(plan)
     diverges, warnings = torque_loop_diverges(plan, asked), torque_loop_warnings(plan, asked)
     if options.json:
@@ -43,7 +45,7 @@ def analyse(options: AnalyseOptions) -> int:
 
 
 def _facts(found: "Analysis") -> dict[str, Any]:
-    """Returns what was found, for scripts; seconds throughout."""
+    """Returns the results as data for JSON; all times are in seconds."""
     return {
         "periods": {"acceleration": found.acceleration_periods, "torque": found.torque_periods},
         "delays": {channel.name.lower(): delays for channel, delays in found.delays.items()},
@@ -60,7 +62,9 @@ def _facts(found: "Analysis") -> dict[str, Any]:
 
 
 def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: bool, diverges: bool) -> list[str]:
-    """Returns what was found, for people."""
+    """Returns the results as lines for people.
+
+    `warnings` are about the torque loop, which `diverges` or not; `closed` says that the torque path is closed."""
     channels = _enumeration([channel.name.lower() for channel in found.delays])
     accelerations, torques = (_ms(periods) for periods in (found.acceleration_periods, found.torque_periods))
     lines = [f"{name}: channels {channels}; accelerations every {accelerations}, torques every {torques}"]
@@ -69,11 +73,9 @@ def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: boo
         for channel, delays in found.delays.items()
         if any(d > 0 for d in delays)
     ]
+    lines.append(f"  delays of the scenario's links: {', '.join(late) if late else 'none'}; no link loses messages")
     lines.append(
-        f"  delays of the scenario's links: {', '.join(late) if late else 'none'}; none of them loses anything"
-    )
-    lines.append(
-        "  taken for granted: torque does what acceleration asks, no limit acts, avoidance is silent"
+        "  assumed: robots follow the desired accelerations exactly, no limit acts, avoidance does not act"
         + (", bus and drives take no time" if closed else "")
     )
     for block in found.blocks:
@@ -89,8 +91,8 @@ def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: boo
         return lines
     if found.centroid_age > 0:
         lines.append(
-            f"  positions are {1e3 * found.centroid_age:.4g} ms old at the coordinator: while the formation moves, its "
-            "centroid is off by what it moves in that time"
+            f"  positions are {1e3 * found.centroid_age:.4g} ms old at the coordinator: the centroid of a moving formation is "
+            "off its trajectory by the distance that it moves in this time"
         )
     beyond = "beyond these delays, " if late else ""
     lines.append(f"  {beyond}all messages of one channel may be later by up to")
@@ -99,25 +101,25 @@ def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: boo
 
 
 def _later(found: "LargestDelay") -> str:
-    """Returns how much later messages may be, and what is then."""
+    """Returns in words how much later messages may be, and what happens beyond that.  Only for a formation that settles."""
     assert found.ticks is not None
     assert found.seconds is not None
     why = {
         "unstable": "one tick more does not settle",
-        "timeout": "one tick more is older than the timeout allows, and is not used at all",
-        "limit": "more has not been tried",
+        "timeout": "with one tick more they are older than the timeout allows, and not used at all",
+        "limit": "longer delays have not been tried",
     }
     return f"{1e3 * found.seconds:.6g} ms ({found.ticks} ticks of {1e3 * found.tick_s:g} ms); {why[found.ends]}"
 
 
 def _ms(seconds: Sequence[float]) -> str:
-    """Returns times as one, or as from the least to the most."""
+    """Returns times [s] as text in milliseconds: one number if all are equal, else the smallest and the largest."""
     least, most = (f"{1e3 * each:g}" for each in (min(seconds), max(seconds)))
     return f"{least} ms" if least == most else f"{least} to {most} ms"
 
 
 def _enumeration(names: Sequence[str]) -> str:
-    """Returns names as a sentence has them."""
+    """Returns names as a list in words: `a, b and c`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
@@ -126,11 +128,11 @@ ANALYSE: Final = Command(
     options=AnalyseOptions,
     work=analyse,
     about="""\
-Computes, without a run, whether the formation settles with the periods and the constant delays
-of the scenario's links, and how much later all messages of a channel may be until it does not.
-Robots are taken to do what accelerations ask; a torque loop that is too slow for that is said.
-Links that lose messages or have delays that vary, and laws that are not linear, are refused:
-run those.""",
+Computes, without a run, whether the formation settles with the periods of the scenario and the
+constant delays of its links, and how much later all messages of one channel may come before it
+no longer settles.  It assumes that robots follow the desired accelerations exactly, and reports
+a torque loop that is too slow for that.  It refuses links that lose messages or whose delays
+vary, and laws that are not linear: run such scenarios instead.""",
     examples={
         "echelon analyse paper": "states may be up to 6 ms late",
         "echelon analyse lab --set 'links=[{channel=\"state\",delay=0.3}]'": "with a delay",

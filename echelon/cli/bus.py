@@ -20,13 +20,13 @@ class ListenOptions(ScenarioOptions):
     can: str | None = field(
         default=None,
         metadata=option(
-            "where to listen; of several buses all, with commas between (default: what the scenario says; of a run's "
-            "folder, its can.log is read)",
+            "where to listen; with several buses one URL for each, with commas between (default: what the scenario "
+            "says; for a run's folder, its can.log)",
             "URL",
         ),
     )
     seconds: float | None = field(
-        default=None, metadata=option("end after so long (default: at Ctrl-C)", "S", parse=seconds)
+        default=None, metadata=option("end after S seconds (default: at Ctrl-C)", "S", parse=seconds)
     )
     json: bool = field(default=False, metadata=JSON)
 
@@ -35,18 +35,20 @@ class ListenOptions(ScenarioOptions):
 class CanOptions(ListenOptions):
     """Options of `echelon can`."""
 
-    speed: float | None = field(default=None, metadata=option("replay a run's can.log, X times as fast as it was", "X"))
+    speed: float | None = field(
+        default=None, metadata=option("replay a run's can.log, X times as fast as the run", "X")
+    )
 
 
 def can(options: CanOptions) -> int:
-    """Shows what is on a scenario's buses, wheel by wheel; or what was, in a run."""
-    from echelon.cli.listening import show_again, show_end, show_growing, show_live
+    """Shows the frames on a scenario's buses, or in a run's can.log, wheel by wheel."""
+    from echelon.cli.showing import show_again, show_end, show_growing, show_live
     from echelon.sim.run_state import goes_on
 
     plan, folder = _plan_of(options)
     if folder is None or options.can is not None:
         if options.speed is not None:
-            raise UsageError("--speed: is for a run's folder without --can")
+            raise UsageError("--speed: is for a run's folder without --can; live frames come at their own speed")
         show_live(plan, options.can, options.seconds, options.json)
     elif options.speed is None and goes_on(folder):
         show_growing(plan, folder, options.seconds, options.json)
@@ -65,35 +67,35 @@ class RefereeOptions(ListenOptions):
 
     tolerance: float | None = field(
         default=None,
-        metadata=option("how late a cyclic frame may be, live (default: half its period)", "S"),
+        metadata=option("live: how late a cyclic frame may be (default: half its period)", "S"),
     )
 
 
 def referee(options: RefereeOptions) -> int:
-    """Says what breaks the contract on a scenario's buses, or in a run's can.log; 1 if something does."""
-    from echelon.cli.listening import judge_live, judge_run, told, verdict
+    """Prints what breaks the contract on a scenario's buses, or in a run's can.log.  Returns exit code 1 if something does."""
+    from echelon.cli.judging import finding_lines, judge_live, judge_run, verdict
     from echelon.sim.results.rendering import json_text
     from echelon.sim.run_state import goes_on
 
     plan, folder = _plan_of(options)
-    over = folder is not None and options.can is None
-    if folder is not None and over:
+    logged = folder is not None and options.can is None
+    if folder is not None and logged:
         if goes_on(folder):
-            print(f"echelon: {folder}: the run goes on; this is about what its can.log holds by now", file=sys.stderr)
+            print(f"echelon: {folder}: the run goes on; this is about what its can.log holds so far", file=sys.stderr)
         report = judge_run(plan, folder)
     else:
         report = judge_live(plan, options.can, options.seconds, options.tolerance, quiet=options.json)
     if options.json:
         print(json_text(report))
     else:
-        for line in told(report) if over else ():  # live they are told as they are found
+        for line in finding_lines(report) if logged else ():  # live, they were printed as they were made
             print(line)
         print(verdict(report))
     return 1 if report.kinds else 0
 
 
 def _plan_of(options: ListenOptions) -> "tuple[Plan, Path | None]":
-    """Returns the plan of a scenario or of a run's folder, and that folder.  Raises UserError."""
+    """Returns the plan of the scenario, and the run's folder if the argument SCENARIO names one.  Raises UserError."""
     from echelon.cli.scenario_file import read_scenario
     from echelon.shipped import run_folder
 
@@ -110,19 +112,21 @@ class DrivesOptions(ScenarioOptions):
     can: str | None = field(
         default=None,
         metadata=option(
-            "socketcan:vcan0, udp_multicast:<group>:<port>, or auto; one for each bus, with commas between "
-            "(default: what the scenario says)",
+            "where the drives are: socketcan:vcan0, udp_multicast:<group>:<port>, or auto; with several buses one URL for "
+            "each, with commas between (default: what the scenario says)",
             "URL",
         ),
     )
     seconds: float | None = field(
-        default=None, metadata=option("end after so long (default: at Ctrl-C)", "S", parse=seconds)
+        default=None, metadata=option("end after S seconds (default: at Ctrl-C)", "S", parse=seconds)
     )
-    json: bool = field(default=False, metadata=option("print JSON: an object of what is there, then one each second"))
+    json: bool = field(
+        default=False, metadata=option("print JSON: an object about the drives, then one with their state every second")
+    )
 
 
 def drives(options: DrivesOptions) -> int:
-    """Serves a scenario's buses with its virtual drives, in real time."""
+    """Runs the virtual drives of a scenario alone, in real time."""
     from echelon.cli.drive_bench import serve
     from echelon.cli.scenario_file import read_scenario
     from echelon.sim.bus_urls import bus_urls, check_wall_clock
@@ -130,7 +134,9 @@ def drives(options: DrivesOptions) -> int:
     _, plan = read_scenario(options.scenario, [*options.overrides, "can.path=closed", "can.virtual_drives=true"])
     urls = bus_urls(plan, options.can, False)
     if not urls or any(url.startswith("virtual") for url in urls):
-        raise UsageError("drives without a bus to others: give --can socketcan:vcan0, udp_multicast: or auto")
+        raise UsageError(
+            "drives need a bus that other processes can use: give --can socketcan:vcan0, udp_multicast: or auto"
+        )
     check_wall_clock(plan, urls)
     serve(plan, urls, options.seconds, options.json)
     return 0
@@ -142,10 +148,11 @@ COMMANDS: Final[tuple[Command[Any], ...]] = (
         options=DrivesOptions,
         work=drives,
         about="""\
-Puts the virtual drives of a scenario on its buses, in real time, without any robot: a bench
-for a host of yours.  Faults that the scenario has for its drives happen, counted from the start.""",
+Runs the virtual drives of a scenario on its buses, in real time and without robots, to try your
+own host on them.  Wheels turn freely.  Faults of drives that the scenario schedules happen, at
+times counted from the start of this command.""",
         examples={
-            "echelon drives lab --can auto": "on vcan0 where there is one, else on a multicast bus, which it names",
+            "echelon drives lab --can auto": "on vcan0 if it exists, else on a multicast bus; prints which",
             "echelon drives lab --set robot.drive.protocol=odrive --can socketcan:vcan0": "nine robots with ODrives",
             "echelon drives lab --seconds 1.0 --json": "for scripts",
         },
@@ -156,13 +163,13 @@ for a host of yours.  Faults that the scenario has for its drives happen, counte
         options=CanOptions,
         work=can,
         about="""\
-Shows the torque, state and faults of every wheel as the frames on the buses say them, with
-rates and loads: live, a table in a terminal or a line each second; or how a run ended.  Of a run
-that goes on it follows can.log to the end.""",
+Shows the torque, state and faults of every wheel, as the frames on the buses say them, with
+frame rates and bus loads: in a terminal a live table, otherwise a line every second.  For the
+folder of a run it reads can.log: it shows how the run ended, or follows a run that goes on.""",
         examples={
             "echelon can lab --can socketcan:vcan0": "live",
-            "echelon can runs/demo": "how a run ended, or how it goes",
-            "echelon can runs/demo --speed 10.0 --json": "a run ten times as fast as it was, an object each second",
+            "echelon can runs/demo": "how a run ended, or a run that goes on",
+            "echelon can runs/demo --speed 10.0 --json": "a run ten times as fast, an object every second",
         },
         codes={0: "shown"},
     ),
@@ -171,12 +178,13 @@ that goes on it follows can.log to the end.""",
         options=RefereeOptions,
         work=referee,
         about="""\
-Looks at frames alone: periods, counters, checksums, limits, state machines, silence.  Says
-what breaks the contract of the scenario's drives and their host.""",
+Judges the frames on the buses, and nothing else: periods, counters, checksums, limits, state
+machines, silence.  Prints what breaks the contract between the scenario's drives and their
+host.""",
         examples={
-            "echelon referee runs/demo": "a run that is over",
+            "echelon referee runs/demo": "the can.log of a run",
             "echelon referee lab --can socketcan:vcan0 --seconds 10.0": "live",
         },
-        codes={0: "nothing is found", 1: "something breaks the contract"},
+        codes={0: "no findings", 1: "something breaks the contract"},
     ),
 )

@@ -1,7 +1,7 @@
-"""What `echelon drives` does: the virtual drives of a scenario alone, on a bus and a wall clock.  A bench to try hosts on.
+"""What `echelon drives` does: it runs the virtual drives of a scenario alone, in real time, to try a host on them.
 
-There are no robots: the wheels stand on a bench, each with the inertia and friction of its drive's table.  Faults that
-the scenario has for its drives happen, counted from the start.
+There are no robots.  Each wheel turns freely, with the inertia and friction that the scenario gives to its drive.  The faults
+of drives that the scenario schedules happen, at times counted from the start of the command.
 """
 
 import json
@@ -19,17 +19,18 @@ from echelon.errors import UsageError
 from echelon.plan.plan import Plan
 
 LINE_S: Final = 1.0
-"""Between two lines."""
+"""Time between two lines [s]"""
 SHOWN: Final = 3
-"""Robots whose wheels a line tells of, at most."""
+"""Largest number of robots whose wheels are shown in a line"""
 Facts = dict[str, Any]
-"""What JSON can say"""
+"""Data for JSON"""
 
 
 def serve(plan: Plan, urls: Sequence[str], seconds: float | None, as_json: bool) -> None:
-    """Serves the buses for some seconds, or until Ctrl-C; says what is there, then how it stands, each second.
+    """Runs the drives for some seconds, or until Ctrl-C.  Prints what there is to command, then the state every second.
 
-    The plan has a closed torque path with virtual drives.  Raises UsageError if a bus cannot be had."""
+    The plan must have a closed torque path with virtual drives; `urls` has a URL for each of its buses.  Raises UsageError if a
+    bus cannot be opened."""
     with ExitStack() as stack:
         try:
             buses = [stack.enter_context(open_bus(url)) for url in urls]
@@ -60,7 +61,7 @@ def serve(plan: Plan, urls: Sequence[str], seconds: float | None, as_json: bool)
 
 
 def bench_facts(plan: Plan, urls: Sequence[str]) -> Facts:
-    """Returns what there is to command, and where."""
+    """Returns what a host needs to know: the buses, and each robot's protocol, bus and addresses; times in seconds."""
     buses = zip(plan.can.buses, urls, strict=True)
     return {
         "buses": [{"name": bus.name, "url": url, "listen": listen_command(url)} for bus, url in buses],
@@ -79,7 +80,7 @@ def bench_facts(plan: Plan, urls: Sequence[str]) -> Facts:
 
 
 def bench_lines(bench: Facts) -> list[str]:
-    """Returns the same in lines for people."""
+    """Returns the result of `bench_facts` as lines for people."""
     lines = [f"bus {bus['name']}: {bus['url']}; to listen: {bus['listen']}" for bus in bench["buses"]]
     width = max(len(robot["name"]) for robot in bench["robots"])
     for robot in bench["robots"]:
@@ -93,7 +94,7 @@ def bench_lines(bench: Facts) -> list[str]:
 
 
 def state_facts(plan: Plan, drives: WallDrives, buses: Sequence[Bus], now_s: float) -> Facts:
-    """Returns how things stand: frames, robots whose wheels turn or have torque, what was refused."""
+    """Returns the state at `now_s` [s]: counts of frames, robots whose wheels turn or have torque, refused frames by reason."""
     lost, destroyed = drives.lost_and_destroyed()
     refused = sum((placed.drive.refused for placed in drives.bank.drives), Counter[str]())
     return {
@@ -109,9 +110,9 @@ def state_facts(plan: Plan, drives: WallDrives, buses: Sequence[Bus], now_s: flo
 
 
 def _wheels(plan: Plan, drives: WallDrives) -> list[Facts]:
-    """Returns torques [N m] and speeds [rad/s], right and left, of the robots where there are any."""
+    """Returns torques [N m] and speeds [rad/s] of the right and the left wheel, for robots where some are not zero."""
     rows: dict[int, Facts] = {}
-    for placed in drives.bank.drives:  # the right wheel's before the left one's
+    for placed in drives.bank.drives:  # the drive of the right wheel comes before that of the left
         robot = placed.place.robot
         row = rows.setdefault(robot, {"robot": plan.robots[robot].name, "torques": [], "speeds": []})
         row["torques"] += [motor.torque for motor in placed.drive.motors]
@@ -120,7 +121,7 @@ def _wheels(plan: Plan, drives: WallDrives) -> list[Facts]:
 
 
 def state_line(facts: Facts) -> str:
-    """Returns the same in one line."""
+    """Returns the result of `state_facts` in one line."""
     parts = [f"{facts['time']:6.1f} s", f"{facts['received']} frames in, {facts['sent']} out"]
     for key, text in (("not_sent", "not sent"), ("lost", "lost on the bus"), ("destroyed", "destroyed on the bus")):
         if facts[key]:

@@ -15,14 +15,15 @@ class DoctorOptions:
     """Options of `echelon doctor`."""
 
     scenario: str | None = field(
-        default=None, metadata=argument(f"whether this machine can run it: {SCENARIO}", "SCENARIO")
+        default=None,
+        metadata=argument(f"check also whether this machine can run this scenario: {SCENARIO}", "SCENARIO"),
     )
     overrides: tuple[str, ...] = field(default=(), metadata=OVERRIDES)
     json: bool = field(default=False, metadata=JSON)
 
 
 def doctor(options: DoctorOptions) -> int:
-    """Says what this machine can do; 1 if something is missing that every run needs."""
+    """Checks this machine and prints the results.  Returns exit code 1 if something is missing that every run needs."""
     from echelon.cli.scenario_file import read_scenario
     from echelon.sim.doctor.doctor import examine, text
 
@@ -40,9 +41,10 @@ DOCTOR: Final = Command(
     options=DoctorOptions,
     work=doctor,
     about="""\
-Tries what a run needs: Python and packages, processors, Zenoh, CAN interfaces, buffers, disk;
-of a scenario also its buses and whether its period can be kept in real time.  Says what helps
-where something is missing.  It changes nothing and needs no root.""",
+Tries what a run needs: Python and packages, processors, Zenoh, CAN interfaces, buffers, disk.
+With a scenario, it also checks whether its frames fit its buses, and whether this machine keeps
+its period in real time.  Gives advice where something is missing.  It changes nothing and needs
+no root.""",
     examples={
         "echelon doctor": "this machine",
         "echelon doctor lab": "and whether it can run the lab's nine robots in real time",
@@ -56,11 +58,11 @@ where something is missing.  It changes nothing and needs no root.""",
 class CompletionOptions:
     """Options of `echelon completion`."""
 
-    shell: Literal["bash", "zsh", "fish"] = field(metadata=argument("whose script", "SHELL"))
+    shell: Literal["bash", "zsh", "fish"] = field(metadata=argument("the shell", "SHELL"))
 
 
 def completion_script(shell: str, parser: ArgumentParser) -> str:
-    """Returns the script that teaches a shell to complete commands, options, their values, scenarios and files."""
+    """Returns a script with which `shell` completes commands, options, their values, shipped scenarios and files."""
     import shtab
 
     from echelon.shipped import shipped
@@ -80,7 +82,9 @@ def completion_script(shell: str, parser: ArgumentParser) -> str:
 
 
 def _actions(parser: ArgumentParser) -> Iterator[Action]:
-    """Yields the arguments of all commands of a parser, which then have their line in the list of commands alone."""
+    """Yields the arguments of a parser and of all its commands.
+
+    On the way it removes the long descriptions of the commands: completion then shows their summaries in one line."""
     for action in parser._actions:
         yield action
         for command in action.choices.values() if isinstance(action.choices, dict) else ():
@@ -89,7 +93,7 @@ def _actions(parser: ArgumentParser) -> Iterator[Action]:
 
 
 def completion(make_parser: Callable[[], ArgumentParser]) -> Command[CompletionOptions]:
-    """Returns the command `completion`, for the commands of a parser that will be made by then."""
+    """Returns the command `completion`; `make_parser` makes the parser of all commands when the command is called."""
 
     def work(options: CompletionOptions) -> int:
         print(completion_script(options.shell, make_parser()))
@@ -100,8 +104,8 @@ def completion(make_parser: Callable[[], ArgumentParser]) -> Command[CompletionO
         options=CompletionOptions,
         work=work,
         about="""\
-Prints a script with which a shell completes commands, options, their values, shipped scenarios
-and files.""",
+Prints a script with which your shell completes commands, options, their values, the names of
+shipped scenarios, and files.""",
         examples={
             "source <(echelon completion bash)": "in ~/.bashrc",
             "echelon completion zsh > _echelon": "in a folder of $fpath",

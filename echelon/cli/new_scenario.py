@@ -1,6 +1,6 @@
-"""What `echelon new` writes: a tame scenario of any size, with a comment on what each part is for.
+"""Makes the text of the scenario that `echelon new` writes: groups of any size, with a comment on each part.
 
-The robots are those of lab.toml.  They start near the places that the formation wants them in, each a little off."""
+The robots are those of lab.toml.  They start near their desired places, each at a small distance from it."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -16,21 +16,25 @@ from echelon.planning.shapes import Point
 from echelon.sim.parts.loading import parse
 
 SIDE: Final = 1.0
-"""Between neighbours in a group [m]"""
+"""Distance between neighbours in a group [m]"""
 BETWEEN: Final = 1.4
-"""Between groups, beyond their own size [m]"""
+"""Distance between the edges of neighbouring groups [m]"""
 OFF: Final = 0.15
-"""How far from its place a robot, and besides a group, starts [m]"""
+"""Distance of a robot at the start from its place in the group, and of a group from its place in the formation [m]"""
 TURN: Final = 2.4
-"""Between the directions in which two neighbours are off [rad], the golden angle: they scatter evenly"""
+"""Angle between the directions in which two neighbours are displaced [rad]: the golden angle, which scatters them evenly"""
 
 
 def sizes(text: str) -> tuple[int, ...]:
-    """Returns the sizes of the groups that `2x3` (two of three) or `2,3,5` stand for.  Raises UsageError."""
+    """Returns the sizes of the groups in a text: `2x3` is two groups of three, `2,3,5` three groups.
+
+    Raises UsageError for any other text, and if there are more than `MAX_ROBOTS` robots."""
     first, times, second = text.partition("x")
     numbers = [second] * int(first) if times and first.isdecimal() and len(first) < 4 else text.split(",")
     if not all(number.isdecimal() and 0 < int(number) <= MAX_ROBOTS for number in numbers) or not numbers:
-        raise UsageError(f"--groups {text}: must be groups and robots in each, as 2x3, or sizes of groups, as 2,3,5")
+        raise UsageError(
+            f"--groups {text}: must be the number of groups x robots in each, like 2x3, or the sizes of groups, like 2,3,5"
+        )
     if sum(map(int, numbers)) > MAX_ROBOTS:
         raise UsageError(
             f"--groups {text}: {sum(map(int, numbers))} robots, but a bus has identifiers for {MAX_ROBOTS}"
@@ -39,14 +43,17 @@ def sizes(text: str) -> tuple[int, ...]:
 
 
 def scenario_text(name: str, groups: Sequence[int], drive: str | None) -> str:
-    """Returns the scenario as TOML.  Raises ScenarioError for a name that is none."""
+    """Returns a scenario as TOML.
+
+    `groups` are the sizes of the groups.  `drive` is the protocol of virtual drives that close the torque path; None: the path
+    is mirrored.  Raises ScenarioError if `name` is not allowed as a name."""
     text = _text(name, groups, drive, _room(groups, drive))
     parse(text, f"{name}.toml")
     return text
 
 
 def _room(groups: Sequence[int], drive: str | None) -> int:
-    """Returns how many robots may share a bus: all of them if they fit it, else as many as do."""
+    """Returns the largest number of robots that fit one bus, at most all of them and at least 1."""
     robots = sum(groups)
     if _fits(robots, drive):
         return robots
@@ -54,10 +61,10 @@ def _room(groups: Sequence[int], drive: str | None) -> int:
 
 
 def _fits(robots: int, drive: str | None) -> bool:
-    """True if so many robots fit a bus of 1 Mbit/s."""
+    """Returns whether the frames of this number of robots fit a bus of 1 Mbit/s."""
     try:
         _, plan = parse(_text("probe", [robots], drive, robots), "probe.toml")
-    except ScenarioError:  # there are not so many node ids
+    except ScenarioError:  # a bus has not enough node ids for them
         return False
     return bus_fit(plan, 0).fits
 
@@ -78,7 +85,7 @@ def _head(name: str, groups: Sequence[int], drive: str | None) -> str:
 
 
 def _bus(buses: Sequence[Sequence[int]], drive: str | None) -> list[str]:
-    """Returns the tables of the buses: one where all robots fit it, else as many as each group needs."""
+    """Returns the lines of the table `[can]`."""
     count = len({bus for group in buses for bus in group})
     path = (
         ['path = "closed"  # the plant takes what the drives report; "mirror": the bus only shows the torques']
@@ -90,7 +97,9 @@ def _bus(buses: Sequence[Sequence[int]], drive: str | None) -> list[str]:
 
 
 def _buses(groups: Sequence[int], room: int) -> list[list[int]]:
-    """Returns the number of each robot's bus, group by group."""
+    """Returns the number of each robot's bus, group by group.
+
+    If all robots fit one bus (`room`), there is one; else each group has buses of its own, as many as it needs."""
     if sum(groups) <= room:
         return [[0] * size for size in groups]
     first, found = 0, []
@@ -101,9 +110,9 @@ def _buses(groups: Sequence[int], room: int) -> list[list[int]]:
 
 
 def _claims(groups: Sequence[int]) -> list[str]:
-    """Returns what a run is to show, for the blocks that there are."""
+    """Returns the lines of the claims, for the blocks that the scenario has."""
     blocks = {"intra": (4.0, max(groups) > 1), "inter": (8.0, len(groups) > 1), "centroid": (15.0, True)}
-    lines = ["# What a run is expected to show; its verdict fails otherwise."]
+    lines = ["# Claims: what a run must show, or its verdict is FAILS."]
     for block, (settled_by, there) in blocks.items():
         if there:
             lines += ["[[claims]]", f'block = "{block}"', f"settled_by = {settled_by}  # [s]", ""]
@@ -111,13 +120,13 @@ def _claims(groups: Sequence[int]) -> list[str]:
 
 
 def _formation(groups: Sequence[int], buses: Sequence[Sequence[int]]) -> list[str]:
-    """Returns the tree: groups side by side, their robots around them."""
+    """Returns the lines of the table `[formation]`: the groups in their shape, and the robots of each in theirs."""
     radius = max(hypot(*point) for size in groups for point in _points(size, SIDE))
     apart = round(2 * radius + BETWEEN, 1)
     middles = _points(len(groups), apart, groups)
     several = max(map(max, buses)) > 0
     lines = [
-        "# The tree: a formation of groups, groups of robots.  Shapes are wanted, starts are where robots are at first."
+        "# The tree: a formation of groups, groups of robots.  `shape` is what is desired, `start` where a robot is at time 0."
     ]
     lines += ["[formation]", *_shape(len(groups), apart)]
     robot = 0
@@ -135,7 +144,7 @@ def _formation(groups: Sequence[int], buses: Sequence[Sequence[int]]) -> list[st
 
 
 def _shape(count: int, side: float) -> list[str]:
-    """Returns the key that names the shape of some children."""
+    """Returns the line of the desired shape of a number of children; none for one child."""
     if count == 1:
         return []
     kind, key = {2: ("line", "spacing"), 3: ("triangle", "side")}.get(count, ("polygon", "side"))
@@ -143,7 +152,7 @@ def _shape(count: int, side: float) -> list[str]:
 
 
 def _points(count: int, side: float, weights: Sequence[int] = ()) -> list[Point]:
-    """Returns the places of children in their shape, about their (weighted) centroid [m]."""
+    """Returns the places of children in their shape, relative to their centroid [m].  `weights` are their numbers of robots."""
     points = {1: [(0.0, 0.0)], 2: shapes.line(2, side), 3: shapes.triangle(side)}.get(count) or shapes.polygon(
         count, side
     )
@@ -153,24 +162,24 @@ def _points(count: int, side: float, weights: Sequence[int] = ()) -> list[Point]
 
 
 _HEAD = """\
-# What each key means, and all others: `echelon schema scenario --markdown`.  SI units throughout.
+# All keys and their meanings: `echelon schema scenario --markdown`.  All values are in SI units.
 name = "{name}"
 description = "{description}"
 duration = 30.0  # [s]
-seed = 1  # of everything random
+seed = 1  # of all random draws
 
 [periods]
-acceleration = 0.01  # [s]: the control loop
-torque = 0.01  # [s]: the torque loop in the robot
+acceleration = 0.01  # of the control loop [s]
+torque = 0.01  # of the torque loop in each robot [s]
 
-# What all robots have in common.  A group's `robot`, and a robot itself, may say otherwise.
+# Values of all robots.  The table `robot` of a group, and a robot's own table, may replace them.
 [robot]
 mass = 4.0
 inertia = 0.12
 wheel_radius = 0.05
-arm = 0.15  # half the track
-offset = 0.1  # from the axle to the point that is controlled
-heading = 0.0  # at the start, in radians
+arm = 0.15  # half the distance between the wheels
+offset = 0.1  # from the axle forward to the point that is controlled
+heading = 0.0  # at the start [rad]
 torque_limit = 1.5
 torque_rate_limit = 100.0
 wheel_speed_limit = 40.0
@@ -180,9 +189,9 @@ _DRIVE = """\
 protocol = "{protocol}"
 torque_limit = 1.8
 rated_torque = 1.0
-lag = 0.001  # of the current loop
+lag = 0.001  # time constant of the current loop [s]
 
-# The last gate before the bus: what it does not let pass becomes zero torque.
+# Limits of the torque commands on the bus.  A command beyond them is replaced by zero torque.
 [robot.envelope]
 torque_limit = 1.5
 rise_limit = 1.05
@@ -190,13 +199,13 @@ fall_limit = 1.05
 window_limit = 3.0
 """
 _REST = """\
-# Where the centroid of all robots is to be.
+# Desired trajectory of the centroid of all robots.
 [trajectory]
 kind = "line"
-start = [0.8, 0.0]  # where it is at time 0: the robots have to catch up
+start = [0.8, 0.0]  # its place at time 0; the robots start behind it and catch up
 velocity = [0.2, 0.0]
 
-# Each layer has a time scale: groups settle before the formation does, and that before the centroid.
+# Each layer has a time scale: the groups settle first, then the formation, then the centroid.
 [law]
 epsilon = [0.5, 0.5]
 lead = 0.5
@@ -211,7 +220,7 @@ avoidance_radius = 0.32
 sensing_radius = 0.6
 force_limit = 20.0
 
-# Delay and loss, to try what they do (`echelon analyse` says how much delay may be):
+# Delay and loss of messages, to try out (`echelon analyse` computes how much delay is possible):
 # [[links]]
 # channel = "state"
 # delay = 0.05

@@ -1,7 +1,13 @@
-"""A command, and its options: a frozen dataclass whose fields become arguments of argparse, by their types.
+"""Commands and their options.  The options of a command are a frozen dataclass; each field becomes an argument of argparse.
 
-`str`, `float` and `Path` are read as such, `Literal` gives the choices, `bool` is a flag, of a tuple there may be several,
-and `| None` means that it may be left out.  A field without a default must be given.
+type of the field   argument
+str, float, Path    one value of this type
+Literal             one of these values
+bool                a flag without a value
+tuple[T, ...]       any number of values of type T
+T | None            one value of type T, which may be left out
+
+A field without a default must be given.  The metadata of a field come from `argument` or `option`.
 """
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
@@ -21,21 +27,21 @@ class Command(Generic[Options]):
     name: str
     options: type[Options]
     work: Callable[[Options], int]
-    """Returns the exit code.  Raises UserError for what the user can mend."""
+    """Does the work and returns the exit code.  Raises UserError for a mistake of the user"""
     about: str
-    """What it does, in lines that fit a terminal"""
+    """Text of the help: what the command does, in lines that fit a terminal"""
     examples: Mapping[str, str]
-    """Command lines that work as they stand, and what each is for"""
+    """Command lines that can be typed as they are, each with its purpose"""
     codes: Mapping[int, str]
-    """What its exit codes mean, except for 2 and 3, which mean the same for all commands"""
+    """Meanings of the exit codes 0 and 1; also of 2 or 3 if there is more to say than for all commands"""
 
     def add_options(self, parser: ArgumentParser) -> None:
-        """Gives a parser the arguments that fill the options."""
+        """Adds the arguments for all options to a parser."""
         for one in fields(self.options):  # type: ignore[arg-type]
             _add(parser, one)
 
     def read_options(self, parsed: Namespace) -> Options:
-        """Returns the options that such a parser has read; what was not given has its default."""
+        """Returns the options from what that parser has read; an option that was not given has its default."""
         given = {name: value for name, value in vars(parsed).items() if value is not None}
         names = [one.name for one in fields(self.options) if one.name in given]  # type: ignore[arg-type]
         return self.options(
@@ -45,7 +51,7 @@ class Command(Generic[Options]):
 
 @dataclass(frozen=True, slots=True)
 class _Choices:
-    """What may be typed for an option.  It is asked for when something was typed, or is to be completed."""
+    """The values that an option may have, for argparse.  They are looked up only when one was typed or is to be completed."""
 
     ask: Callable[[], Sequence[str]]
 
@@ -57,7 +63,7 @@ class _Choices:
 
 
 def argument(text: str, metavar: str) -> dict[str, Any]:
-    """Returns the metadata of a field that is given by its place: its help, and what stands for it there."""
+    """Returns the metadata of a field that is given by its position: its help text, and its name in the help."""
     return {"text": text, "metavar": metavar, "flag": None, "parse": None, "choices": None}
 
 
@@ -69,15 +75,16 @@ def option(
     parse: Parse | None = None,
     choices: Callable[[], Sequence[str]] | None = None,
 ) -> dict[str, Any]:
-    """Returns the metadata of a field that is given by `--name`, or by `flag`.
+    """Returns the metadata of a field that is given by an option: `flag`, by default `--` and the field's name.
 
-    `parse` makes the value of what was typed, where the type alone would take too much.  It raises ValueError.  `choices`
-    returns what may be typed, where it takes long to know that."""
+    `text` is its help; `metavar` stands for its value there.  `parse` turns what was typed into the value, or raises
+    ValueError, if that takes more than the field's type.  `choices` returns the values that are allowed; use it instead of
+    Literal if it takes long to find them."""
     return {"text": text, "metavar": metavar, "flag": flag, "parse": parse, "choices": choices}
 
 
 def _add(parser: ArgumentParser, one: "Field[Any]") -> None:
-    """Gives a parser the argument that fills a field."""
+    """Adds the argument for a field to a parser."""
     kind, several = _kind(one.type)
     flag, required = one.metadata["flag"], one.default is MISSING
     settings: dict[str, Any] = {"help": _help(one)}
@@ -98,7 +105,10 @@ def _add(parser: ArgumentParser, one: "Field[Any]") -> None:
 
 def _kind(annotation: Any) -> tuple[Any, bool]:
     """Returns the type of one value of a field, and whether there may be several."""
-    if get_origin(annotation) in (UnionType, Union):  # what `|` makes of a Literal is the latter
+    if get_origin(annotation) in (
+        UnionType,
+        Union,
+    ):  # `Literal[…] | None` is a Union, other types with `|` are a UnionType
         (annotation,) = (one for one in get_args(annotation) if one is not type(None))
     return (get_args(annotation)[0], True) if get_origin(annotation) is tuple else (annotation, False)
 
@@ -113,7 +123,7 @@ def _help(one: "Field[Any]") -> str:
 
 
 def _typed(parse: Any) -> Parse:
-    """Returns a parser of values that tells argparse what is wrong in our words."""
+    """Returns a function that parses a value for argparse; its errors say in plain words what is wrong."""
 
     def typed(text: str) -> object:
         try:

@@ -1,6 +1,6 @@
-"""The parser of the command line: which commands there are, where they are defined, and what their help says.
+"""The parser of the command line: the list of all commands, and the layout of their help.
 
-A family of commands is imported when one of them is typed, so that `--help` is there at once.
+The module that defines a command is imported only when that command was typed, so that `--help` answers at once.
 """
 
 import sys
@@ -26,8 +26,9 @@ FIRST_LOOK: Final = {
 }
 CODES: Final = {0: "done, and the verdict holds", 1: "the verdict fails"}
 MISTAKES: Final = {2: "the input is wrong", 3: "it could not be done, or not to its end"}
+"""Exit codes that mean the same for all commands, unless a command says more about one of them"""
 WIDTH: Final = 42
-"""Of an example, with two spaces behind it"""
+"""Width of the column of examples in the help [characters]; longer examples have a line of their own"""
 
 
 def _run() -> Commands:
@@ -48,6 +49,12 @@ def _results() -> Commands:
     return COMMANDS
 
 
+def _recordings() -> Commands:
+    from echelon.cli.recordings import COMMANDS
+
+    return COMMANDS
+
+
 def _bus() -> Commands:
     from echelon.cli.bus import COMMANDS
 
@@ -61,13 +68,13 @@ def _machine() -> Commands:
 
 
 class Entry(NamedTuple):
-    """A command in the list of commands: what it does in a line, and what imports its family."""
+    """A command in the list of commands: its summary in one line, and the function that imports its definition."""
 
     summary: str
     family: Callable[[], Commands]
 
     def command(self, name: str) -> "Command[Any]":
-        """Returns the command itself."""
+        """Returns the definition of the command with this name, which the family must have."""
         return next(command for command in self.family() if command.name == name)
 
 
@@ -82,6 +89,8 @@ ENTRIES: Final = {
     "report": Entry("write the report of a run, or a comparison of several", _results),
     "export": Entry("write a run's tables as CSV or Parquet", _results),
     "recover": Entry("rebuild what a killed run left, or mend a recording that was cut off", _results),
+    "replay": Entry("feed a run's messages to today's roles and say where their outputs differ", _recordings),
+    "diff": Entry("say where two runs part: the first instant, message and value", _recordings),
     "drives": Entry("run the virtual drives of a scenario alone, to try hosts on", _bus),
     "can": Entry("show what is on a scenario's CAN buses, wheel by wheel", _bus),
     "referee": Entry("say what breaks the contract on a scenario's CAN buses", _bus),
@@ -91,14 +100,16 @@ ENTRIES: Final = {
 
 
 class Call(NamedTuple):
-    """What was typed: the command with its options, ready to be called for its exit code."""
+    """A command with its options.  `work` runs it and returns the exit code; `debug` is the option `--debug`."""
 
     work: Callable[[], int]
     debug: bool
 
 
 def read(arguments: Sequence[str] | None = None) -> Call:
-    """Returns what was typed.  Ends the process, as argparse does, for --help and for mistakes."""
+    """Returns the command and options in these arguments, by default those of the process.
+
+    Ends the process for `--help` (exit code 0) and for wrong arguments (2), as argparse does."""
     words = sys.argv[1:] if arguments is None else arguments
     parsed = make_parser([name for name in ENTRIES if name in words]).parse_args(words)
     command: Command[Any] = parsed.command
@@ -107,12 +118,12 @@ def read(arguments: Sequence[str] | None = None) -> Call:
 
 
 def make_parser(names: Collection[str] = ENTRIES.keys()) -> ArgumentParser:
-    """Returns the parser of all commands; only those of these names have their options."""
+    """Returns the parser of all commands.  Only the commands with these names get their options and their help."""
     top = _Parser(
         prog="echelon", description=ABOUT, epilog=_epilog("a first look", FIRST_LOOK, CODES), formatter_class=_Help
     )
     top.add_argument("--version", action="version", version=f"echelon {__version__}")
-    debug = "show the traceback of an error that nobody expected, or in a part of yours"
+    debug = "show the traceback of an unexpected error, or of an error in a part of yours"
     top.add_argument("--debug", action="store_true", help=debug)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     for name, entry in ENTRIES.items():
@@ -127,7 +138,7 @@ def make_parser(names: Collection[str] = ENTRIES.keys()) -> ArgumentParser:
 
 
 class _Help(RawDescriptionHelpFormatter):
-    """Help with room for the names of commands in its left column."""
+    """Formats help with a left column that is wide enough for the names of all commands."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=28)
@@ -135,17 +146,19 @@ class _Help(RawDescriptionHelpFormatter):
 
 
 class _Parser(ArgumentParser):
-    """A parser that says a mistake in one line."""
+    """A parser that reports a mistake in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}\n")
 
 
 def _epilog(title: str, examples: Mapping[str, str], codes: Mapping[int, str]) -> str:
+    """Returns the end of a help text: examples with their purposes in a second column, and the exit codes."""
     lines = [f"{title}:"]
     for example, purpose in examples.items():
         lines += (
             [f"  {example:<{WIDTH}}{purpose}"] if len(example) < WIDTH else [f"  {example}", f"  {'':{WIDTH}}{purpose}"]
         )
-    lines += ["", "exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in {**codes, **MISTAKES}.items())]
+    meanings = sorted({**MISTAKES, **codes}.items())
+    lines += ["", "exit codes: " + ", ".join(f"{code} {meaning}" for code, meaning in meanings)]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""`echelon run`: from what the user typed to a run, its folder, and the exit code."""
+"""The command `echelon run`."""
 
 import sys
 from dataclasses import dataclass, field
@@ -14,40 +14,41 @@ class RunOptions(ScenarioOptions):
     """Options of `echelon run`."""
 
     engine: Literal["processes", "inprocess"] = field(
-        default="processes", metadata=option("every role its own process over Zenoh, or all roles in one process")
+        default="processes",
+        metadata=option("processes: every role its own process, over Zenoh; inprocess: all roles in one process"),
     )
     clock: Literal["virtual", "wall"] = field(
         default="virtual",
-        metadata=option("as fast as messages come, bit for bit repeatable; or paced by real time"),
+        metadata=option("virtual: as fast as messages come, repeatable bit for bit; wall: paced by real time"),
     )
     out: Path | None = field(
         default=None, metadata=option("folder of the run (default: runs/<scenario>-<utc time>)", "DIR")
     )
     replace: bool = field(
-        default=False, metadata=option("delete the run of another scenario that the folder of --out holds")
+        default=False, metadata=option("if the folder of --out holds a run of another scenario, delete that run")
     )
     can: str | None = field(
         default=None,
         metadata=option(
-            "where frames go: socketcan:vcan0, udp_multicast:<group>:<port>, virtual, auto or none; one for each bus, "
-            "with commas between (default: what the scenario says)",
+            "where CAN frames go: socketcan:vcan0, udp_multicast:<group>:<port>, virtual, auto or none; with several "
+            "buses one URL for each, with commas between (default: what the scenario says)",
             "URL",
         ),
     )
     json: bool = field(default=False, metadata=option("print the summary as JSON"))
-    quiet: bool = field(default=False, metadata=option("show no progress"))
-    no_report: bool = field(default=False, metadata=option("write no report.html"))
+    quiet: bool = field(default=False, metadata=option("show no progress while the run goes on"))
+    no_report: bool = field(default=False, metadata=option("do not write report.html"))
     keep_going: bool = field(
-        default=False, metadata=option("go on though a robot's state is not finite; otherwise the run stops there")
+        default=False, metadata=option("go on when a robot's state is not finite; without it the run stops there")
     )
     stall_timeout: float = field(
         default=30.0,
-        metadata=option("give a run up that stands still for so long, in virtual time", "S", parse=seconds),
+        metadata=option("in virtual time: give up a run that makes no progress for S seconds", "S", parse=seconds),
     )
 
 
 def run(options: RunOptions) -> int:
-    """Runs a scenario; leaves a folder."""
+    """Runs a scenario, writes its folder, and prints the summary."""
     if options.engine == "processes":
         from echelon.sim.processes.children import warm_up
 

@@ -1,4 +1,4 @@
-"""Commands about scenarios: `scenarios`, `new`, `validate`, `dbc`, `schema`; `analyse` has a module of its own."""
+"""Commands about scenarios: `scenarios`, `new`, `validate`, `dbc`, `schema`, and `analyse` from the module `analyse`."""
 
 import json
 import sys
@@ -49,25 +49,25 @@ def _protocols() -> tuple[str, ...]:
 class NewOptions:
     """Options of `echelon new`."""
 
-    name: str = field(metadata=argument("what it is called: NAME.toml is written into this folder", "NAME"))
+    name: str = field(metadata=argument("name of the scenario; NAME.toml is written into this folder", "NAME"))
     groups: str = field(
         default="2x3",
-        metadata=option("groups and robots in each (2x3), or the sizes of unequal groups (2,3,5)", "SIZES"),
+        metadata=option("number of groups x robots in each (2x3), or the sizes of unequal groups (2,3,5)", "SIZES"),
     )
     drive: str | None = field(
         default=None,
         metadata=option(
-            "close the torque path over virtual drives that speak this protocol; otherwise torques are only shown on "
-            "the bus",
+            "close the torque path over virtual drives that speak this protocol; without it the bus only shows the "
+            "torques",
             "PROTOCOL",
             choices=_protocols,
         ),
     )
-    force: bool = field(default=False, metadata=option("replace a file that is there already"))
+    force: bool = field(default=False, metadata=option("overwrite NAME.toml if it exists"))
 
 
 def new(options: NewOptions) -> int:
-    """Writes a scenario to begin with."""
+    """Writes a new scenario file."""
     from echelon.cli.new_scenario import scenario_text, sizes
 
     path = Path(f"{options.name}.toml")
@@ -76,7 +76,7 @@ def new(options: NewOptions) -> int:
         with path.open("w" if options.force else "x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise UsageError(f"{path}: is there already; --force replaces it") from None
+        raise UsageError(f"{path}: exists already; --force overwrites it") from None
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     print(path)
@@ -87,12 +87,12 @@ def new(options: NewOptions) -> int:
 class ValidateOptions(ScenarioOptions):
     """Options of `echelon validate`."""
 
-    strict: bool = field(default=False, metadata=option("warnings count as mistakes: exit code 2"))
+    strict: bool = field(default=False, metadata=option("exit with code 2 if there are warnings"))
     json: bool = field(default=False, metadata=JSON)
 
 
 def validate(options: ValidateOptions) -> int:
-    """Checks a scenario, says what it means, and warns of what is hardly meant."""
+    """Checks a scenario; prints what it means, and warnings about what is allowed but probably not intended."""
     from echelon.bridge.timing.fit import describe_fit
     from echelon.cli.scenario_file import read_scenario
     from echelon.sim.forecast.warnings import warnings
@@ -126,12 +126,12 @@ def validate(options: ValidateOptions) -> int:
 class DbcOptions(ScenarioOptions):
     """Options of `echelon dbc`."""
 
-    bus: str | None = field(default=None, metadata=option("which of the scenario's buses, if it has several", "NAME"))
-    json: bool = field(default=False, metadata=option("print JSON: the DBCs by the names of their buses"))
+    bus: str | None = field(default=None, metadata=option("name of the bus, if the scenario has several", "NAME"))
+    json: bool = field(default=False, metadata=option("print JSON: an object with the DBC of each bus by its name"))
 
 
 def dbc(options: DbcOptions) -> int:
-    """Prints the DBC of a scenario's drives."""
+    """Prints the DBC of a bus: what the frames of its drives mean."""
     from echelon.bridge.protocols.plan_dbc import plan_dbc
     from echelon.cli.scenario_file import read_scenario
 
@@ -158,7 +158,9 @@ class SchemaOptions:
     what: Literal["scenario", "summary"] = field(
         metadata=argument("scenario: the keys of scenario files; summary: those of a run's summary.json", "WHAT")
     )
-    markdown: bool = field(default=False, metadata=option("of scenarios: print a reference page for people, Markdown"))
+    markdown: bool = field(
+        default=False, metadata=option("for scenario: print a reference page for people, in Markdown")
+    )
 
 
 def schema(options: SchemaOptions) -> int:
@@ -168,7 +170,7 @@ def schema(options: SchemaOptions) -> int:
     from echelon.sim.results.rendering import summary_schema
 
     if options.markdown and options.what != "scenario":
-        raise UsageError(f"--markdown: is for scenario, not for {options.what}")
+        raise UsageError(f"--markdown: is only for the schema of scenarios, not of {options.what}")
     if options.markdown:
         sys.stdout.write(reference_page(REGISTRY))
     else:
@@ -182,10 +184,10 @@ COMMANDS: Final[tuple[Command[Any], ...]] = (
         name="scenarios",
         options=ScenariosOptions,
         work=scenarios,
-        about="Lists the scenarios that are shipped.  Every command takes them by their names.",
+        about="Lists the scenarios that come with echelon.  Every command takes their names.",
         examples={
             "echelon scenarios": "names and descriptions",
-            "echelon scenarios --json": "the same with their files, to look at or to copy",
+            "echelon scenarios --json": "also the paths of their files, to read or to copy them",
         },
         codes={0: "done"},
     ),
@@ -194,11 +196,11 @@ COMMANDS: Final[tuple[Command[Any], ...]] = (
         options=NewOptions,
         work=new,
         about="""\
-Writes NAME.toml: a tame scenario that is valid and holds when it is run, with a comment on
-what each part is for.  Then change it: `echelon validate NAME.toml` says what is wrong.""",
+Writes NAME.toml: a scenario to begin with.  It is valid, its verdict is HOLDS, and each part has
+a comment.  Change it, then check it with `echelon validate NAME.toml`.""",
         examples={
             "echelon new my": "my.toml, two groups of three robots",
-            "echelon new mine --groups 2x3 --drive odrive": "torques over a CAN bus, to ODrives and back",
+            "echelon new mine --groups 2x3 --drive odrive": "torques go over a CAN bus to ODrives and back",
             "echelon new ours --groups 2,3,5": "groups of unequal size",
         },
         codes={0: "written"},
@@ -208,17 +210,18 @@ what each part is for.  Then change it: `echelon validate NAME.toml` says what i
         options=ValidateOptions,
         work=validate,
         about="""\
-Checks a scenario.  Says what it means: robots, duration, time scales, whether its frames fit
-its CAN buses; or all that is wrong with it, a line each: key, value, and what is allowed.
-Warns, a line each, of what is allowed but hardly meant: time scales near the period, more
-torque or speed than robots have, claims beyond the end, delays that act as longer ones.""",
+Checks a scenario.  Prints what it means: robots, duration, time scales, whether its frames fit
+its CAN buses.  Or prints all its mistakes, one line each: key, value, and what is allowed.
+Prints warnings, one line each, about what is allowed but probably not intended: time scales
+near the period, more torque or speed than the robots have, claims about times after the end,
+delays that are rounded up to whole periods.""",
         examples={
             "echelon validate lab": "a shipped scenario",
             "echelon validate my.toml --set law.lead=0.5": "a file with one value changed",
             "echelon validate my.toml --strict": "fails if there is a warning",
             "echelon validate runs/demo --json": "the scenario of a run, for scripts",
         },
-        codes={0: "valid", 2: "wrong; with --strict also: there are warnings"},
+        codes={0: "valid", 2: "not valid; with --strict also if there are warnings"},
     ),
     ANALYSE,
     Command(
@@ -227,11 +230,11 @@ torque or speed than robots have, claims beyond the end, delays that act as long
         work=dbc,
         about="""\
 Prints what the frames of a scenario's drives mean, as a DBC for cantools, SavvyCAN, Wireshark
-and the like.  A run leaves the same in its folder.""",
+and the like.  A run writes the same file into its folder.""",
         examples={
-            "echelon dbc lab > torque.dbc": "of the only bus",
-            "echelon dbc drives --bus can1": "of one of several buses",
-            "echelon dbc runs/demo": "of a run",
+            "echelon dbc lab > torque.dbc": "the scenario has one bus",
+            "echelon dbc drives --bus can1": "the scenario has several buses",
+            "echelon dbc runs/demo": "the scenario of a run",
         },
         codes={0: "printed"},
     ),
@@ -240,10 +243,10 @@ and the like.  A run leaves the same in its folder.""",
         options=SchemaOptions,
         work=schema,
         about="""\
-Prints the JSON schema of scenario files: with it an editor completes keys, shows what they
-mean, and marks mistakes.  In VS Code (Even Better TOML), Helix or Zed (taplo), the line
-  #:schema ./scenario.schema.json
-at the top of a scenario does that.  Or prints the schema of summary.json, for scripts.""",
+Prints the JSON schema of scenario files, or that of summary.json.  With the schema an editor
+completes keys, shows what they mean, and marks mistakes.  In VS Code (Even Better TOML), in
+Helix and in Zed (taplo), this line at the top of a scenario names it:
+  #:schema ./scenario.schema.json""",
         examples={
             "echelon schema scenario > scenario.schema.json": "for editors",
             "echelon schema scenario --markdown": "all keys with their defaults and units, for people",

@@ -1,4 +1,4 @@
-"""What a command's SCENARIO stands for: whatever `echelon.shipped.scenario_path` knows, or standard input."""
+"""Reads the scenario that a command's argument SCENARIO names: see `echelon.shipped.scenario_path`; `-` is standard input."""
 
 import sys
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ STANDARD_INPUT: Final = "-"
 
 
 def read_scenario(name: str, overrides: Sequence[str] = ()) -> tuple[Scenario, Plan]:
-    """Returns the scenario that a name stands for, with overrides, and its plan.  Raises UserError."""
+    """Returns the scenario with this name, and its plan; `overrides` are those of `--set`.  Raises UserError."""
     if name != STANDARD_INPUT:
         return load(scenario_path(name), overrides)
     try:

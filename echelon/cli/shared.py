@@ -1,4 +1,4 @@
-"""Options that several commands have, and what their help has in common."""
+"""Options and help texts that several commands share."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -17,13 +17,13 @@ JSON: Final = option("print JSON, for scripts")
 
 
 def seconds(text: str) -> float:
-    """Returns a duration [s] that was typed.  Raises ValueError."""
+    """Returns the duration [s] in a text.  Raises ValueError if it is not a number more than 0 and less than 1e9."""
     try:
         value = float(text)
     except ValueError:
         value = 0.0
     if not 0 < value < 1e9:
-        raise ValueError(f"{text!r} is no duration in seconds, more than 0")
+        raise ValueError(f"{text!r} is no duration in seconds: must be a number more than 0")
     return value
 
 

@@ -59,7 +59,7 @@ def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[
         (error["loc"][:-1], close)
         for error in errors
         if error["type"] == "extra_forbidden"
-        and (close := _close_key(str(error["loc"][-1]), _walk(error["loc"], root)[1]))
+        and (close := close_key(str(error["loc"][-1]), _walk(error["loc"], root)[1]))
     }
     reported = [e for e in errors if e["type"] != "missing" or (e["loc"][:-1], e["loc"][-1]) not in misspelled]
     return list(dict.fromkeys(mistake for error in reported for mistake in _mistakes(error, root, above)))
@@ -135,11 +135,11 @@ def _unknown(key: str, model: Any) -> str:
     known = ", ".join(sorted(_bare(model).model_fields))
     if not known:
         return "unknown key; there are none here"
-    close = _close_key(key, model)
+    close = close_key(key, model)
     return f"unknown key; did you mean {close!r}?" if close else f"unknown key; known here: {known}"
 
 
-def _close_key(key: str, model: Any) -> str | None:
+def close_key(key: str, model: Any) -> str | None:
     """Returns the key of a table that most resembles an unknown key, or None."""
     close = get_close_matches(key, sorted(_bare(model).model_fields), n=1, cutoff=0.5)
     return close[0] if close else None

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.planning.explain import explain, is_array, key_text, short
+from echelon.planning.missing_keys import fill_missing
 from echelon.planning.plan_maker import PlanError, make_plan
 from echelon.plugins import Registry, Source
 from echelon.scenario.part_fields import PartContext
@@ -55,9 +56,14 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
             refused.append((f"with --set {short(override)}", str(error)))
     if refused:
         raise _scenario_error(name, refused)
+    missing: list[tuple[str, str]] = []
+    found: list[tuple[str, str]] = []
     try:
+        missing = fill_missing(table)
         scenario = Scenario.model_validate(table, context=PartContext(registry, folder))
-        return scenario, make_plan(scenario, registry)
+        plan = make_plan(scenario, registry)
+        if not missing:
+            return scenario, plan
     except ValidationError as error:
         mistakes = explain(error.errors(include_url=False), Scenario)
         found = [(key_text(mistake.keys), mistake.text) for mistake in mistakes]
@@ -65,7 +71,7 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
         found = [(line.split(" = ")[0].split(":")[0], line) for line in error.lines]
     except RecursionError:
         found = [("formation", "formation: groups are nested too deep")]
-    raise _scenario_error(name, [(_overridden(key, changed), text) for key, text in found])
+    raise _scenario_error(name, [(_overridden(key, changed), text) for key, text in [*found, *missing]])
 
 
 def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioError:

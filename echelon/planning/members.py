@@ -23,8 +23,6 @@ ROBOT_DEFAULTS: Final[dict[str, Any]] = {
     "wheel_speed_limit": float("inf"),
 }
 DEFAULT_PLANT: Final = "paper"
-NEEDED: Final = ("mass", "inertia", "wheel_radius", "arm", "offset", "start")
-"""Keys that must be given for every robot, on some level."""
 MAX_ROBOTS: Final = 127
 """Largest number of robots: a bus has identifiers for no more if each robot has three of its own."""
 MAX_NS: Final = 2**62
@@ -175,11 +173,10 @@ class _Walk:
         return node
 
     def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
-        """Returns a robot from its table, inherited values included.  Raises PlanError."""
+        """Returns a robot from its table, inherited values included: all that a robot needs (`planning.missing_keys`).
+
+        Raises PlanError."""
         values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
-        if lacking := [needed for needed in NEEDED if needed not in values]:
-            nowhere = "missing (neither here, nor in its group, nor in [robot])"
-            raise PlanError(*(f"{place.key}.{needed}: {nowhere}" for needed in lacking))
         if values["offset"] == 0:
             raise PlanError(f"{place.key}.offset = 0: must not be zero, or the wheels cannot steer the reference point")
         least = values["mass"] * values["offset"] * values["offset"]

@@ -15,6 +15,7 @@ from echelon.plan.plan import Plan
 from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
 
 SHORT_QUEUE: Final = 100
+"""A burst soon fills the send queue of an interface that is shorter than this [frames]"""
 NET: Final = Path("/sys/class/net")
 _CAN_TYPE: Final = "280"  # ARPHRD_CAN of linux/if_arp.h
 _TOOLS: Final = f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}:/usr/local/sbin:/usr/sbin:/sbin"
@@ -23,17 +24,19 @@ _TOOLS: Final = f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}:/us
 def check_vcan(name: str = "vcan0") -> Diagnosis:
     """Checks for the virtual interface that runs use first; the advice is how to get it."""
     if interface_is_up(name):
-        return Diagnosis(name, "ok", "is up: frames go there, `candump vcan0` shows them")
+        return Diagnosis(name, "ok", "is up: frames of runs go there, `candump vcan0` shows them")
     if (NET / name).exists():
         return Diagnosis(name, "note", "is there, but down", (f"sudo ip link set {name} up",))
     if vcan_module():
         more = "sudo modprobe vcan; " if not Path("/sys/module/vcan").exists() else ""
         made = f"sudo ip link add {name} type vcan; sudo ip link set {name} up txqueuelen 1000"
-        return Diagnosis(name, "note", "not there; the kernel can have it", (more + made,))
-    guest = "deploy/vcan.sh COMMAND, which runs it in a guest that has one"
+        return Diagnosis(name, "note", "does not exist, but the kernel can make it", (more + made,))
+    guest = "deploy/vcan.sh COMMAND, which runs the command in a small virtual machine that has vcan0"
     if not shutil.which("linux.uml", path=_TOOLS):
         guest += " (apt-get install user-mode-linux busybox-static iproute2)"
-    return Diagnosis(name, "note", "not there, and this kernel has no module vcan", ("use udp_multicast, or", guest))
+    return Diagnosis(
+        name, "note", "does not exist, and this kernel has no module vcan", ("use udp_multicast, or", guest)
+    )
 
 
 def vcan_module() -> bool:
@@ -63,12 +66,12 @@ def check_multicast() -> Diagnosis:
             sent = sender.send(0x123, b"doctor")
             frame = receiver.recv(LIMIT_S / 2) if sent else None
             took_us = (time.perf_counter() - begun_s) * 1e6
-            error = sender.error or receiver.error or "it did not come"
+            error = sender.error or receiver.error or "it did not arrive"
     except OSError as cannot:
         return Diagnosis("multicast", "note", str(cannot), advice)
     if frame is None or (frame.can_id, frame.data) != (0x123, b"doctor"):
         return Diagnosis("multicast", "note", f"a frame on {url}: {error}", advice)
-    return Diagnosis("multicast", "ok", f"a frame on {url} came, after {took_us:.0f} µs")
+    return Diagnosis("multicast", "ok", f"a frame on {url} arrived after {took_us:.0f} µs")
 
 
 def check_interfaces(net: Path = NET) -> list[Diagnosis]:
@@ -108,11 +111,11 @@ def _interface(name: str, queue: int, link: dict[str, Any]) -> Diagnosis:
         speed = "" if name.startswith("vcan") or bitrate else " type can bitrate 500000"
         advice.append(f"sudo ip link set {name} up{speed}")
     elif state in ("BUS-OFF", "STOPPED"):
-        advice.append(f"sudo ip link set {name} type can restart-ms 100; look at wiring, termination and bit rate")
+        advice.append(f"sudo ip link set {name} type can restart-ms 100; check wiring, termination and bit rate")
     elif state in ("ERROR-PASSIVE", "ERROR-WARNING"):
-        advice.append("frames are disturbed or not acknowledged: look at wiring, termination and bit rate")
+        advice.append("frames are disturbed or not acknowledged: check wiring, termination and bit rate")
     parts.append(f"queue of {queue} frames")
-    if queue < SHORT_QUEUE and not name.startswith("vcan"):  # a vcan has no queue that could be full
+    if queue < SHORT_QUEUE and not name.startswith("vcan"):  # the queue of a vcan is never full
         advice.append(f"a burst fills it: sudo ip link set {name} txqueuelen 1000")
     return Diagnosis(name, "note" if advice else "ok", ", ".join(parts), tuple(advice))
 
@@ -124,7 +127,7 @@ def check_tools() -> Diagnosis:
     if len(found) < len(packages):
         wanted = " ".join(sorted({package for name, package in packages.items() if name not in found}))
         return Diagnosis(
-            "CAN tools", "note", f"there: {', '.join(found) or 'none'}", (f"sudo apt-get install {wanted}",)
+            "CAN tools", "note", f"found: {', '.join(found) or 'none'}", (f"sudo apt-get install {wanted}",)
         )
     return Diagnosis("CAN tools", "ok", ", ".join(found))
 

@@ -24,9 +24,12 @@ from echelon.sim.doctor.can_checks import check_fit, check_interfaces, check_mul
 from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
 
 PACKAGES: Final = ("eclipse-zenoh", "python-can", "numpy", "scipy", "cantools", "mcap", "pydantic")
+"""Packages whose versions are shown"""
 OLDEST: Final = (3, 11)
+"""The oldest version of Python that works"""
 SLEEPS: Final = 200
 SLEEP_S: Final = 0.001
+"""Waking is measured with `SLEEPS` sleeps of this time [s]"""
 LATE_S: Final = 0.002
 """A process that is woken later than this cannot keep periods of a few milliseconds [s]"""
 BUFFER: Final = 4 << 20
@@ -34,7 +37,7 @@ BUFFER: Final = 4 << 20
 SPACE: Final = 1 << 30
 """Recordings soon fill less free space than this [bytes]"""
 BUSY: Final = 0.6
-"""The load of the processors above which runs miss deadlines; 1 is all of them"""
+"""Estimated load above which a run on a wall clock misses deadlines, as a fraction of all processors"""
 HANDLING: Final = 2.0
 """Processor time that a message costs sender, receiver and recorder, as a multiple of its measured round trip.  Measured:
 paper.toml with recorder and CAN takes two processors 1.3 ms for a tick of 24 messages"""
@@ -45,11 +48,14 @@ class Measured:
     """Measurements of some checks that later checks use."""
 
     jitter_s: float = 0.0
+    """Lateness after a short sleep that 99 % of the sleeps do not exceed [s]"""
     round_trip_s: float = 0.0
+    """Median time of a message there and back over Zenoh [s]"""
 
 
 def examine(plan: Plan | None = None, folder: Path | None = None) -> list[Diagnosis]:
-    """Makes all checks and returns their results; `folder` is the place of recordings.  A `plan` adds its own checks."""
+    """Makes all checks and returns their results; `folder` is the folder for recordings, by
+    default the working folder.  With a `plan` it is also checked whether this machine can run it."""
     measured = Measured()
     checks: list[tuple[str, Callable[[], Diagnosis]]] = [
         ("Python", check_python),
@@ -111,16 +117,18 @@ def check_python(packages: tuple[str, ...] = PACKAGES) -> Diagnosis:
             missing.append(package)
     if missing or sys.version_info < OLDEST:
         lacks = f"; not installed: {', '.join(missing)}" if missing else ""
-        return Diagnosis("Python", "problem", ", ".join(versions) + lacks, ("make setup, with Python 3.11 or newer",))
+        return Diagnosis(
+            "Python", "problem", ", ".join(versions) + lacks, ("run `make setup` with Python 3.11 or newer",)
+        )
     return Diagnosis("Python", "ok", ", ".join(versions))
 
 
 def check_processors() -> Diagnosis:
     """Checks the number of processors and their present load."""
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
-    said = f"{cores} to run on, load {load:.2f}, Linux {platform.release()}"
+    said = f"{cores} available, load {load:.2f}, Linux {platform.release()}"
     if load > cores:
-        return Diagnosis("processors", "note", said, ("busy: runs on a wall clock will be late",))
+        return Diagnosis("processors", "note", said, ("the machine is busy: runs on a wall clock will be late",))
     return Diagnosis("processors", "ok", said)
 
 
@@ -132,9 +140,9 @@ def check_waking(measured: Measured) -> Diagnosis:
         time.sleep(SLEEP_S)
         late.append(time.perf_counter() - begun_s - SLEEP_S)
     measured.jitter_s = float(np.percentile(late, 99))
-    said = f"{np.median(late) * 1e6:.0f} µs late after 1 ms of sleep, at most 1 % later than {measured.jitter_s * 1e3:.2g} ms"
+    said = f"{np.median(late) * 1e6:.0f} µs late after 1 ms of sleep (median); 99 % at most {measured.jitter_s * 1e3:.2g} ms"
     if measured.jitter_s > LATE_S:
-        return Diagnosis("waking", "note", said, ("keep to virtual time, or to periods of 10 ms and more",))
+        return Diagnosis("waking", "note", said, ("use virtual time, or periods of 10 ms and more",))
     return Diagnosis("waking", "ok", said)
 
 
@@ -152,7 +160,12 @@ def check_zenoh(measured: Measured, rounds: int = 200) -> Diagnosis:
         ping = one.publisher("doctor/ping")
         other.declare_token("doctor/here")
         if one.watch_tokens("doctor/*").wait(["doctor/here"], LIMIT_S / 2):
-            return Diagnosis("Zenoh", "problem", f"no connection over {endpoint}", ("is lo up? is there a firewall?",))
+            return Diagnosis(
+                "Zenoh",
+                "problem",
+                f"no connection over {endpoint}",
+                ("check that the interface lo is up, and that no firewall blocks it",),
+            )
         times = []
         for _ in range(rounds):
             back.clear()
@@ -171,10 +184,10 @@ def check_buffers(core: Path = Path("/proc/sys/net/core")) -> Diagnosis:
         most, usual = (int((core / name).read_text()) for name in ("rmem_max", "rmem_default"))
     except (OSError, ValueError) as error:
         return Diagnosis("socket buffers", "note", f"not known: {error}")
-    said = f"receive at most {most >> 10} KiB, candump has {usual >> 10} KiB unless it asks (-r)"
+    said = f"at most {most >> 10} KiB for receiving; candump uses {usual >> 10} KiB, or what its option -r asks for"
     if most < BUFFER:
         advice = (
-            f"against lost frames in bursts: sudo sysctl -w net.core.rmem_max={BUFFER} net.core.rmem_default={BUFFER}"
+            f"to lose no frames in bursts: sudo sysctl -w net.core.rmem_max={BUFFER} net.core.rmem_default={BUFFER}"
         )
         return Diagnosis("socket buffers", "note", said, (advice,))
     return Diagnosis("socket buffers", "ok", said)
@@ -185,7 +198,7 @@ def check_disk(folder: Path) -> Diagnosis:
     free = shutil.disk_usage(folder).free
     said = f"{free / 1e9:.3g} GB free in {folder.resolve()}"
     if free < SPACE:
-        return Diagnosis("disk", "note", said, ("record elsewhere with --out, or make room",))
+        return Diagnosis("disk", "note", said, ("record to another disk with --out, or free some space",))
     return Diagnosis("disk", "ok", said)
 
 
@@ -203,12 +216,12 @@ def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Diag
     messages = sum(counts.sent for counts in engine.link_counts()) - before
     cores = len(os.sched_getaffinity(0))
     share = (spent_s + HANDLING * measured.round_trip_s * messages) / max(done, 1) / period_s / cores
-    said = f"period {period_s * 1e3:g} ms: about {100 * share:.0f} % of {cores} processors, for {len(plan.all_roles)} processes"
+    said = f"period {period_s * 1e3:g} ms: {len(plan.all_roles)} processes take about {100 * share:.0f} % of {cores} processors"
     advice = []
     if share > BUSY:
-        advice.append("too much for real time: longer periods, fewer robots, or --clock virtual")
+        advice.append("too much for real time: use longer periods, fewer robots, or --clock virtual")
     if measured.jitter_s > period_s / 2:
         advice.append(
-            f"woken up to {measured.jitter_s * 1e3:.2g} ms late: periods over {2e3 * measured.jitter_s:.2g} ms"
+            f"processes wake up to {measured.jitter_s * 1e3:.2g} ms late: use periods over {2e3 * measured.jitter_s:.2g} ms"
         )
     return Diagnosis("wall clock", "note" if advice else "ok", said, tuple(advice))

@@ -1,1 +1,1 @@
-"""All roles of a run in one process."""
+"""The engine that runs all roles in one process."""

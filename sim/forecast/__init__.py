@@ -1,1 +1,1 @@
-"""What a valid scenario will not do well, said before it is run."""
+"""Warnings about valid scenarios, before they are run: what is allowed, but probably not intended."""

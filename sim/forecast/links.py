@@ -1,7 +1,7 @@
-"""Warnings about links: delays that act as longer ones, and links over which nothing comes.
+"""Warnings about links: delays that are rounded up, and links over which no message is ever used.
 
-A message is sent and used at whole ticks of its link: the shorter of the period at which it is said and that at which its
-receiver acts.  So a delay acts as the next whole number of ticks (docs/architecture.md, 4.2)."""
+The tick of a link is the shorter of two periods: that of its sender and that of its receiver.  Messages are sent and used at
+multiples of it, so a delay acts like the next multiple of the tick (docs/architecture.md, 4.2)."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from echelon.plan.plan import LinkPlan, Plan, RobotPlan
 
 
 def link_warnings(plan: Plan) -> list[str]:
-    """Returns a line for each kind of link that does something else than it seems to."""
+    """Returns the warnings about links, one line for all links with the same warning."""
     return [*_counted(plan, _silence), *_counted(plan, _rounding)]
 
 
 def _counted(plan: Plan, what: Callable[[Plan, LinkPlan], str | None]) -> list[str]:
-    """Returns what is said of links, each text once for each channel, with the number of links."""
+    """Returns the warnings that `what` gives for links: each text once for each channel, with the number of its links."""
     found = Counter(
         (link.channel.name.lower(), text) for link in plan.links if not link.ideal and (text := what(plan, link))
     )
@@ -26,7 +26,7 @@ def _counted(plan: Plan, what: Callable[[Plan, LinkPlan], str | None]) -> list[s
 
 
 def _silence(plan: Plan, link: LinkPlan) -> str | None:
-    """Returns why nothing is ever used of what is sent over a link, if so."""
+    """Returns why no message of a link is ever used; None if some are."""
     tick_ns, duration_ns = tick_of(plan, link), plan.duration_ns
     if link.loss == 1:
         return "loss = 1: nothing arrives"
@@ -42,7 +42,7 @@ def _silence(plan: Plan, link: LinkPlan) -> str | None:
 
 
 def _rounding(plan: Plan, link: LinkPlan) -> str | None:
-    """Returns what a delay acts as, if that is another one."""
+    """Returns the delay like which that of a link acts, in words; None if it is the same."""
     tick_ns, least_ns, most_ns = tick_of(plan, link), link.delay_min_ns, link.delay_max_ns
     tick = f"messages are used at multiples of {tick_ns / 1e9:g} s"
     if most_ns > plan.duration_ns:
@@ -66,5 +66,5 @@ def tick_of(plan: Plan, link: LinkPlan) -> int:
 
 
 def ticks_up(delay_ns: int, tick_ns: int) -> int:
-    """Returns a delay as whole ticks [ns]."""
+    """Returns a delay rounded up to a multiple of the tick [ns]."""
     return -(-delay_ns // tick_ns) * tick_ns

@@ -1,16 +1,17 @@
-"""Warnings about what the start asks of robots: torque, wheel speed, and a torque loop that is fast enough.
+"""Warnings about the motion that a scenario asks of its robots: torque at the start, wheel speed, speed of the torque loop.
 
-What is asked is that of points which do exactly what the law wants, over ideal links, for the first `STEPS` periods.
+The motion is computed for points that follow the desired accelerations exactly, over ideal links, in the first `STEPS` periods.
 
-*Torque* at the start: the inverse of docs/architecture.md, 2.1, for a robot at rest with its own heading.  *Wheel speed*: a
-robot that moves straight ahead at |v| turns its wheels at |v|/r; turning asks for more.
+*Torque* at the start: by the inverse dynamics of docs/architecture.md, 2.1, for a robot at rest with its own heading.
 
-*Torque loop.*  A robot that moves at v turns into its direction of travel: with no acceleration wanted, ω̇ = -(v/d) ω.  The
-torque loop computes that for the middle of its period h and holds it, so with q = h v/d
+*Wheel speed*: a robot that moves straight ahead at |v| turns its wheels at |v|/r; in a turn one wheel is faster.
+
+*Torque loop*: without a desired acceleration, a robot that moves at v turns into its direction of travel: ω̇ = -(v/d) ω.  The
+torque loop computes the torque for the middle of its period h and holds it for the period, so with q = h v/d
 
     ω⁺ = (1 - q + q²/2) ω
 
-which dies away if and only if q < 2.
+which decays if and only if q < 2.
 """
 
 from dataclasses import dataclass
@@ -26,27 +27,27 @@ from echelon.errors import PartRunError
 from echelon.plan.plan import Array, Plan, RobotPlan
 
 STEPS: Final = 1000
-"""Periods for which points are followed"""
+"""Number of periods for which the motion is computed"""
 INSTANTS: Final = 200
-"""At which the trajectory's speed is looked at, over the whole run"""
+"""Number of instants, spread over the run, at which the speed of the trajectory is computed"""
 EDGE: Final = 2.0
-"""q from which on the torque loop diverges"""
+"""The torque loop diverges from this value of q on"""
 NEAR: Final = 1.0
-"""q from which on it is near that"""
+"""The torque loop settles slowly from this value of q on"""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What the start asks of robots, in their order."""
+    """What the scenario asks of the robots, in their order."""
 
     accelerations: Array
-    """At the start, (N, 2) [m/s²]"""
+    """Accelerations at the start, (N, 2) [m/s²]"""
     speeds: Array
-    """The largest, (N,) [m/s]"""
+    """Largest speeds, of the computed motion or of the trajectory, (N,) [m/s]"""
 
 
 def asked_of(plan: Plan) -> Asked:
-    """Returns what is asked of the robots of a plan.  Raises PartRunError if a part that others wrote fails."""
+    """Returns what a plan asks of its robots.  Raises PartRunError if a user's law or trajectory fails."""
     T = min(node.period_ns for node in plan.nodes) * 1e-9
     law = CentralLaw(plan)
     positions, velocities = np.array([robot.start for robot in plan.robots]), np.zeros((len(plan.robots), 2))
@@ -67,7 +68,7 @@ def asked_of(plan: Plan) -> Asked:
 
 
 def motion_warnings(plan: Plan) -> list[str]:
-    """Returns a line for each limit that the start asks more than, and one for a torque loop that is too slow."""
+    """Returns a line for each limit of the robots that is too low for the motion, and one if the torque loop is too slow."""
     try:
         asked = asked_of(plan)
     except PartRunError as error:
@@ -93,7 +94,7 @@ def motion_warnings(plan: Plan) -> list[str]:
 
 
 def torque_loop_warnings(plan: Plan, asked: Asked) -> list[str]:
-    """Returns a line if the torque loop of a robot diverges, or nearly, at the speed that is asked of it."""
+    """Returns a line if the torque loop of a robot diverges, or hardly settles, at the largest speed that is asked of it."""
     q = torque_loop_numbers(plan, asked)
     slow = [at for at, each in enumerate(q) if each >= NEAR]
     if not slow:
@@ -108,12 +109,12 @@ def torque_loop_warnings(plan: Plan, asked: Asked) -> list[str]:
 
 
 def torque_loop_diverges(plan: Plan, asked: Asked) -> bool:
-    """True if the torque loop of some robot diverges at the speed that is asked of it."""
+    """Returns whether the torque loop of any robot diverges at the largest speed that is asked of it."""
     return max(torque_loop_numbers(plan, asked)) >= EDGE
 
 
 def torque_loop_numbers(plan: Plan, asked: Asked) -> list[float]:
-    """Returns q = h v/d of each robot at the speed that is asked of it."""
+    """Returns q = h v/d of each robot, with the largest speed v that is asked of it."""
     return [
         robot.torque_period_ns * 1e-9 * speed / abs(robot.offset)
         for robot, speed in zip(plan.robots, asked.speeds.tolist(), strict=True)
@@ -121,7 +122,7 @@ def torque_loop_numbers(plan: Plan, asked: Asked) -> list[float]:
 
 
 def _start_torque(robot: RobotPlan, ax: float, ay: float) -> float:
-    """Returns the larger torque of both wheels [N m] that an acceleration takes from rest; infinite if that is no number."""
+    """Returns the larger torque of both wheels [N m] for an acceleration [m/s²] from rest; infinite if it is not computable."""
     try:
         torques = make_inverse(robot)(state_at(*robot.start, robot.heading, 0.0, 0.0), ax, ay, 0.0)
     except (ValueError, OverflowError):
@@ -130,5 +131,5 @@ def _start_torque(robot: RobotPlan, ax: float, ay: float) -> float:
 
 
 def _named(plan: Plan, worst: int, count: int) -> str:
-    """Returns a robot's name, and of how many it is the worst."""
+    """Returns the name of robot `worst`, and in words that it is the worst of `count` robots if there are several."""
     return plan.robots[worst].name + (f" (the worst of {count} robots)" if count > 1 else "")

@@ -1,4 +1,4 @@
-"""Warnings about the law and its periods: time scales near the period, and a loop that does not settle as it is sampled."""
+"""Warnings about the law and its periods: time scales near the period, and a control loop that does not settle."""
 
 from typing import Final
 
@@ -8,17 +8,16 @@ from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.plan.plan import Plan
 
 FEWEST: Final = 5
-"""Periods that a time scale should last: with fewer the law acts on what has long changed"""
+"""A time scale should be at least this number of periods; else the state changes too much between two accelerations"""
 
 LARGE: Final = 2000
-"""Size of the run's map up to which it is computed: a warning must not take long"""
+"""Largest size of the map of a hyperperiod whose spectral radius is computed; a larger one takes too long for a warning"""
 
 
 def sampling_warnings(plan: Plan) -> list[str]:
-    """Returns a line if time scales are near the period, and one if the loop with its links does not settle.
+    """Returns a line if time scales are near the period, and one if the control loop with its links does not settle.
 
-    Of laws that are not linear, of links that lose messages or have delays that vary, and of very long delays, only the first
-    is said."""
+    The second is computed only for linear laws, links without loss, and constant delays that are not very long."""
     found = _near_the_period(plan)
     try:
         run = LinearRun(plan)
@@ -30,7 +29,7 @@ def sampling_warnings(plan: Plan) -> list[str]:
 
 
 def _near_the_period(plan: Plan) -> list[str]:
-    """Returns a line if time scales are near the period of their node: about the one that is nearest."""
+    """Returns a line if time scales are near the period of their node; it names the one that is nearest."""
     periods = {
         block.name: (plan.root if block.node is None else plan.formation[block.node]).period_ns / 1e9
         for block in plan.blocks

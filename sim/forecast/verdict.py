@@ -1,4 +1,4 @@
-"""What the verdict of a run will not be able to test, as far as the plan tells."""
+"""Warnings about claims and checks that a run is too short to test."""
 
 from echelon.plan.plan import Plan
 from echelon.sim.results.can_lines import some
@@ -6,7 +6,7 @@ from echelon.sim.results.settling import dwell_ns
 
 
 def verdict_warnings(plan: Plan) -> list[str]:
-    """Returns a line for each claim that the run is too short for, and one if it is too short for health checks."""
+    """Returns a line for each claim that the run is too short to test, and one if it is too short to test growth of errors."""
     end_ns = plan.duration_ns
     found = []
     for at, claim in enumerate(plan.claims):

@@ -1,4 +1,4 @@
-"""All warnings about a plan: what is allowed, but hardly what was meant.  `echelon validate` prints them, a line each."""
+"""All warnings about a plan: what is allowed, but probably not intended.  `echelon validate` prints them, one line each."""
 
 from math import degrees, pi, radians
 
@@ -10,7 +10,7 @@ from echelon.sim.forecast.verdict import verdict_warnings
 
 
 def warnings(plan: Plan) -> tuple[str, ...]:
-    """Returns a line for each thing that is hardly meant; none if there is nothing to say."""
+    """Returns all warnings about a plan, one line each; empty if there are none."""
     return (
         *_heading_warnings(plan),
         *verdict_warnings(plan),
@@ -21,7 +21,7 @@ def warnings(plan: Plan) -> tuple[str, ...]:
 
 
 def _heading_warnings(plan: Plan) -> list[str]:
-    """Headings are in radians: more than a whole turn is hardly meant."""
+    """Returns a line if headings are more than a whole turn: they are probably in degrees instead of radians."""
     turned = [robot for robot in plan.robots if abs(robot.heading) > 2 * pi]
     if not turned:
         return []

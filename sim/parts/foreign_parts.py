@@ -51,4 +51,4 @@ def stalled_in(plan: Plan, error: TookTooLong) -> str:
         role = frame.f_locals.get("self")
         if isinstance(role, (Robot, TreeNode)):
             return f"{plan.all_roles[role.index].name}{runs_text(plan, role.index)}"
-    return "somebody"
+    return "a role that is not known"

@@ -23,16 +23,18 @@ from echelon.sim.parts.time_limit import TookTooLong, time_limit
 PATIENCE_S: Final = 2.0
 """Time limit of one call [s]"""
 INSTANTS: Final = 100
-"""How many instants, spread over the run, a trajectory is tried at, as far as they take no longer than `INSTANTS_S` [s]"""
+"""Number of instants, spread over the run, at which a trajectory is tried; fewer if they take longer than `INSTANTS_S`"""
 INSTANTS_S: Final = 0.5
+"""Time limit for trying a trajectory at its instants [s]; the comparison of its derivatives has as much again"""
 SLOPES: Final = 25
-"""At how many instants the derivatives of a trajectory are compared with its differences, within `INSTANTS_S` more"""
+"""Number of instants at which the derivatives of a trajectory are compared with its differences"""
 SLOPE_STEP_S: Final = 1e-3
-"""Central differences reach from so long before an instant to as long after it [s]"""
+"""Central differences use values at this time before and after an instant [s]"""
 SLOPE_TOLERANCE: Final = 0.1
-"""By this share of its largest value a derivative may differ, and by `SLOPE_FLOOR` [m/s, m/s²]; an error in a derivative is
-larger as a rule, and an honest path is far closer, except at its corners"""
+"""Largest difference that is allowed, as a fraction of the derivative's largest value; `SLOPE_FLOOR` is added to it.  A wrong
+derivative usually differs by more.  A correct one differs by far less, except at corners of the path"""
 SLOPE_FLOOR: Final = 1e-3
+"""Difference that is always allowed [m/s for velocities, m/s² for accelerations]"""
 _T = TypeVar("_T")
 
 
@@ -71,7 +73,8 @@ def _probe_trajectory(plan: Plan) -> None:
 def _probe_slopes(use: str, trajectory: Desired, end_s: float) -> None:
     """Compares velocity and acceleration with central differences of position and velocity.
 
-    Raises PartRunError if they differ at half of the instants or more: at a corner of an honest path they differ too."""
+    Raises PartRunError if they differ at half of the instants or more; at a few instants a correct path may differ, too, since
+    it may have corners there."""
     step_s, begun_s = min(SLOPE_STEP_S, end_s / 100), time.monotonic()
     times, given, found = [], [], []
     for number in range(SLOPES):
@@ -81,7 +84,7 @@ def _probe_slopes(use: str, trajectory: Desired, end_s: float) -> None:
         ask = (partial(trajectory.at, at) for at in (t - step_s, t, t + step_s))
         before, now, after = (_asked(f"{use}: at({t:g})", one) for one in ask)
         times.append(t)
-        given.append(now[1:] + 0.0)  # no -0
+        given.append(now[1:] + 0.0)  # turns -0.0 into 0.0 for the message
         found.append((after - before)[:2] / (2 * step_s))
     wrong = np.abs(np.array(given) - found)  # (instants, 2, 2): velocity and acceleration, x and y
     largest = np.abs(given).max(axis=(0, 2))

@@ -1,1 +1,1 @@
-"""A run as processes: starting them, watching them, ending them."""
+"""A run as processes: the supervisor, which starts, watches and ends them, and the processes themselves."""

@@ -1,9 +1,12 @@
 """The processes on the CAN buses of a run: bridge, virtual drives, referee.
 
 torque path   clock      bridge                drives               referee
-mirror        any        run_mirror_bridge     none                 run_wall_referee on a SocketCAN bus
-closed        virtual    run_lockstep          run_lockstep         none: can.log is judged afterwards
-closed        wall       run_wall_bridge       run_wall_drives      run_wall_referee on a SocketCAN bus
+mirror        virtual    run_mirror_bridge     none                 none
+mirror        wall       run_mirror_bridge     none                 run_wall_referee if a bus is a SocketCAN interface
+closed        virtual    run_lockstep          run_lockstep         none
+closed        wall       run_wall_bridge       run_wall_drives      run_wall_referee if a bus is a SocketCAN interface
+
+Without a referee, can.log is judged after the run.
 """
 
 import gc
@@ -39,7 +42,7 @@ from echelon.sim.processes.watchers import HIGH_WATER, Reception
 
 PROGRESS_S: Final = PROGRESS_NS / 1e9
 BATCH: Final = 16
-"""Messages with frames per batch"""
+"""Largest number of messages with frames in a batch"""
 _T = TypeVar("_T")
 
 

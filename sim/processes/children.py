@@ -5,7 +5,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -94,6 +94,12 @@ class Child:
         return state.partition("(")[2].rstrip(")")
 
 
+def last_words_of(children: Sequence[Child]) -> str:
+    """Returns the ends of the standard error of several processes, each under a heading; "" if there is nothing."""
+    said = [f"\n--- last words of {child.name}:\n{words}" for child in children if (words := child.last_words())]
+    return "".join(said)
+
+
 def warm_up() -> None:
     """Starts the fork server, which imports the processes' modules in the background.  Call it early."""
     context = get_context("forkserver")
@@ -162,9 +168,11 @@ def list_specs(
 
     process        who connects to it
     node           its children
-    recorder       all members and the bridge
+    recorder       all other processes except the referee
     bridge         robots
     drives         robots and the bridge
+
+    Real drives have no process.  The referee connects to no process; it listens to the buses.
     """
     stations = [role.name for role in plan.bus_roles]
     if can_urls and not plan.can.closed:

@@ -26,6 +26,7 @@ from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Ready, Report
 
 READY_TIMEOUT_S: Final = 20.0
+"""How long a process waits for its peers [s]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +34,23 @@ class ProcessSpec:
     """Everything that a process of a run needs to know."""
 
     run: str
+    """Name of the run, which no other run has"""
     kind: str
     """`robot`, `leader`, `coordinator`, `recorder`, `bridge`, `drives` or `referee`"""
     name: str
     index: int
+    """Index of its role in the plan; for recorder, referee and the bridge of a mirrored path a number that is not used"""
     plan: Plan
     virtual: bool
+    """True: virtual time; False: a wall clock"""
     listen: tuple[str, ...]
+    """Endpoints at which its session waits for connections"""
     connect: tuple[str, ...]
+    """Endpoints of other processes to which its session connects"""
     peers: tuple[tuple[str, str], ...]
     """(kind, name) of the processes whose tokens it waits for"""
     watched: bool = True
+    """True: its messages also go to watchers"""
     member: bool = True
     """True: it ends by itself when the run is over.  False: it waits for the order to finish"""
     folder: str = ""

@@ -28,7 +28,9 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
 def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
-    """Runs a process of a run; never returns normally."""
+    """Runs a process of a run until its work is done.  A failure ends the process with exit code 1.
+
+    `control` is its pipe to the supervisor, `words` the pipe that gets its standard error."""
     _die_with(control)
     _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # the name in ps, top and pgrep (15 characters)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but only the supervisor reacts
@@ -70,6 +72,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
 
 
 def _open(spec: ProcessSpec) -> Session:
+    """Returns the session of a process.  Raises StartError if it cannot be opened."""
     try:
         return Session(
             listen=spec.listen,
@@ -82,6 +85,7 @@ def _open(spec: ProcessSpec) -> Session:
 
 
 def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    """Runs a robot, a leader or the coordinator."""
     runner = Runner(
         make_role(spec.plan, spec.index),
         spec.plan,

@@ -8,6 +8,9 @@ breaking off   a failure in one of the above, or   terminates the members, kills
 finishing      members are done or ended           sends `Finish` to bridge, drives, referee and recorder, one after the other
 taking down    all of them are done                sends `End`; kills what is left
 
+The modules beside this one: `children` lists and starts the processes; `stalls` finds out who holds up a run;
+`endings` has the last three phases; `outcome` is what is told of a run, `failures` why it breaks off.
+
 All processes come from one fork server that has imported their modules, so fifteen start in the time of one.  No process
 outlives the supervisor: each notices the hang-up of its pipe and ends, even if the supervisor was killed.  The processes talk
 over the loopback, at an address and ports of this run alone.
@@ -15,105 +18,40 @@ over the loopback, at an address and ports of this run alone.
 
 import signal
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final
 
-from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
+from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
-from echelon.runtime.link import LinkCounts
-from echelon.sim.processes.children import FINISHING, Child, list_specs, start
+from echelon.sim.processes.children import Child, last_words_of, list_specs, start
 from echelon.sim.processes.contract import ProcessSpec
-from echelon.sim.processes.to_process import End, Finish, Start, Told
-from echelon.sim.processes.to_supervisor import (
-    Done,
-    Failed,
-    PartFailed,
-    Ready,
-    RecorderProgress,
-    RecorderReport,
-    Said,
-    Waiting,
-)
-from echelon.sim.results.trace import Array, Trace, TraceBuilder
+from echelon.sim.processes.endings import finish_watchers, stop_members, take_down
+from echelon.sim.processes.failures import NAMED, DivergedError, RunError, StallError, few
+from echelon.sim.processes.outcome import Outcome, Progress, outcome_of
+from echelon.sim.processes.stalls import StallWatch
+from echelon.sim.processes.to_process import Start, Told
+from echelon.sim.processes.to_supervisor import Done, Failed, PartFailed, Ready, RecorderProgress, Said, Waiting
 
-NAMED: Final = 12
-"""The largest number of processes that a note names; the others are counted."""
 START_TIMEOUT_S: Final = 30.0
-STALL_REPORT_S: Final = 3.0
-"""A run in virtual time without progress for this time is reported, with the process that everyone waits for."""
-GRACE_S: Final = 3.0
-"""How long processes may take to end, and watchers to close their files, when a run breaks off."""
-FINISH_TIMEOUT_S: Final = 60.0
-"""How long watchers may take to finish after a complete run."""
+"""How long processes may take to become ready [s]"""
 WALL_START_S: Final = 0.1
-"""The time from `Start` to run time 0 on a wall clock, at least."""
-
-
-@dataclass(slots=True)
-class Progress:
-    """The present state of a run, for a live table; `states` are the last states of the robots, at `states_ns`."""
-
-    phase: str = "starting"
-    time_ns: int = 0
-    states_ns: int = 0
-    states: Array | None = None
-    messages: int = 0
-    started_s: float = 0.0
-    bridge: BridgeProgress = field(default_factory=BridgeProgress)
-    drives: BridgeProgress = field(default_factory=BridgeProgress)
-    note: str = ""
-    """News for the user, for example which process everyone waits for"""
-
-    def hear(self, recorder: RecorderProgress) -> None:
-        """Takes over the progress of the recorder."""
-        self.time_ns, self.messages = recorder.time_ns, recorder.messages
-        self.states, self.states_ns = recorder.states, recorder.states_ns
-
-
-@dataclass(slots=True)
-class Outcome:
-    """The result of a run: the recorded trace, counts, and `failure` if the run did not finish."""
-
-    trace: Trace
-    links: list[LinkCounts]
-    processes: list[Done]
-    can: CanReport | None
-    startup_s: float
-    wall_s: float
-    messages: int
-    failure: str | None = None
-    stopped: str | None = None
-    """Why the run was stopped before its end though nothing failed"""
-
-
-class RunError(Exception):
-    """The run cannot go on; the text says why."""
-
-
-class StallError(RunError):
-    """A run in virtual time made no progress for a while, for `who`."""
-
-    def __init__(self, still_s: float, who: str) -> None:
-        self._still_s, self._who = still_s, who
-        super().__init__(self.text("an unknown instant"))
-
-    def text(self, when: str) -> str:
-        """Returns what happened, in words; `when` it did is known for certain only once all is recorded."""
-        return f"stalled for {self._still_s:.0f} s at {when}: {self._who}"
-
-
-class DivergedError(Exception):
-    """There is no point in going on; the text says why."""
+"""The time from `Start` to run time 0 on a wall clock, at least [s]"""
+WALL_OVERTIME_S: Final = 10.0
+"""How long after the end of a run on a wall clock its members may take to be done [s]"""
+SHOW_S: Final = 0.2
+"""Time between two looks at the progress [s]"""
 
 
 class Supervisor:
-    """One distributed run.
+    """Runs a plan as processes, once.
 
-    `show` is called with the progress about five times a second.  A run in virtual time without progress for
-    `stall_timeout_s` is given up.  `order` may change the order in which processes start."""
+    `run` is a name that no other run has: it is part of the keys of all messages.  `virtual`: in virtual time, else on a wall
+    clock.  `can_urls` has a URL for each bus; without it there are no frames.  `scenario_toml`, `metadata` and `part_files`
+    (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
+    five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up.  With `keep_going` the run
+    does not stop when a robot's state is not finite.  `order` may change the order in which processes start."""
 
     def __init__(
         self,
@@ -135,13 +73,10 @@ class Supervisor:
         self.plan, self.virtual = plan, virtual
         self.progress = Progress()
         self._show = show
-        self._stall_timeout_s = stall_timeout_s
         told = scenario_toml, metadata or {}, part_files or {}
         self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going))
         self._children: list[Child] = []
-        self._moved_s = 0.0
-        self._moved_at = (-1, -1)
-        self._warned = False
+        self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)
 
     def run(self) -> Outcome:
         """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised."""
@@ -156,12 +91,13 @@ class Supervisor:
                 self._children.append(start(spec))
             self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
             startup_s = time.monotonic() - begun_s
-            start_s = time.monotonic() + (0.0 if self.virtual else self._lead_in_s())
+            lead_in_s = 0.0 if self.virtual else self._lead_in_s()
+            start_s = time.monotonic() + lead_in_s
             self._tell_all(Start(round(start_s * 1e9)))
             self.progress.phase, self.progress.started_s = "running", start_s
-            self._moved_s = time.monotonic()
+            self._stalls.begin(time.monotonic())
             members = [child for child in self._children if child.is_member]
-            limit_s = None if self.virtual else self.plan.duration_ns / 1e9 + 10.0
+            limit_s = None if self.virtual else lead_in_s + self.plan.duration_ns / 1e9 + WALL_OVERTIME_S
             self._until(lambda: all(child.done for child in members), limit_s, "not done")
             wall_s = time.monotonic() - start_s
             self.progress.phase = "finishing"
@@ -179,14 +115,16 @@ class Supervisor:
             self.progress.note = failure.splitlines()[0] if failure else self.progress.note
         try:
             if broken:
-                self._stop_members()
-            failure = self._finish_watchers(failure, broken)
+                stop_members(self._children, self._serve)
+            whole = self.virtual and not broken  # on a wall clock, messages may be lost on the way
+            failure = finish_watchers(self._children, self._serve, self._say, failure, whole)
         except KeyboardInterrupt:
             failure = failure or "interrupted"
         finally:
-            self._take_down()
+            take_down(self._children)
             signal.signal(signal.SIGTERM, previous)
-        outcome = self._outcome(failure, startup_s, wall_s)
+        processes = [child.done for child in self._children if child.done is not None]
+        outcome = outcome_of(self.plan, processes, failure, startup_s, wall_s)
         common_ns, _ = outcome.trace.common()
         if stall is not None and len(common_ns):
             outcome.failure = stall.text(f"t = {common_ns[-1] / 1e9:g} s")
@@ -204,9 +142,10 @@ class Supervisor:
             self._serve(0.1)
             self._check_lost()
             now_s = time.monotonic()
-            if now_s - shown_s >= 0.2:
+            if now_s - shown_s >= SHOW_S:
                 shown_s = now_s
-                self._check_stall(now_s)
+                if self.progress.phase == "running" and self.virtual:
+                    self._stalls.check(now_s)
                 self._show(self.progress)
             if deadline_s is not None and now_s > deadline_s:
                 late = [
@@ -215,11 +154,12 @@ class Supervisor:
                     if not (child.ready if what == "not ready" else child.done or not child.is_member)
                 ]
                 who = few([child.name + child.runs() for child in late])
-                words = self._words_of([child.name for child in late[:NAMED]])
-                raise RunError(f"{what} after {timeout_s:g} s: {who}{words}")
+                raise RunError(f"{what} after {timeout_s:g} s: {who}{last_words_of(late[:NAMED])}")
 
     def _serve(self, timeout_s: float) -> None:
-        """Reads the control pipes and the standard error of all children."""
+        """Waits up to `timeout_s` for messages, standard error or the end of any child, and reads what has come.
+
+        Raises RunError or DivergedError if a message says that the run cannot or should not go on."""
         by_handle: dict[Any, Child] = {}
         for child in self._children:
             if not child.control.closed:
@@ -236,6 +176,7 @@ class Supervisor:
                     self._hear(child)
 
     def _hear(self, child: Child) -> None:
+        """Reads one message of a child.  Raises RunError or DivergedError, as `_serve` does."""
         try:
             said: Said = child.control.recv()
         except (EOFError, OSError):
@@ -272,6 +213,7 @@ class Supervisor:
                 child.done = said
 
     def _check_lost(self) -> None:
+        """Raises RunError if a child has ended without its report."""
         for child in self._children:
             if child.done is None and not child.process.is_alive():
                 while not child.control.closed and child.control.poll():
@@ -279,170 +221,12 @@ class Supervisor:
                 if child.done is None:
                     if not child.words.closed:
                         child.hear_words()
-                    raise RunError(
-                        f"lost {child.spec.kind} {child.name} ({child.ending()}){self._words_of([child.name])}"
-                    )
+                    raise RunError(f"lost {child.spec.kind} {child.name} ({child.ending()}){last_words_of([child])}")
 
-    def _words_of(self, names: list[str]) -> str:
-        said = [
-            f"\n--- last words of {child.name}:\n{words}"
-            for child in self._children
-            if child.name in names and (words := child.last_words())
-        ]
-        return "".join(said)
-
-    def _check_stall(self, now_s: float) -> None:
-        """Reports a run in virtual time that makes no progress; raises RunError after `stall_timeout_s`."""
-        if self.progress.phase != "running" or not self.virtual:
-            return
-        at = (self.progress.time_ns, max((child.waiting_ns for child in self._children), default=-1))
-        if at != self._moved_at:
-            self._moved_at, self._moved_s = at, now_s
-            if self._warned:
-                self._warned, self.progress.note = False, "goes on"
-            return
-        still_s = now_s - self._moved_s
-        if still_s > STALL_REPORT_S and not self._warned:
-            self._warned = True
-            self.progress.note = f"stalled at t = {self.progress.time_ns / 1e9:g} s: {self._who_is_waited_for(now_s)}"
-        if still_s > self._stall_timeout_s:
-            raise StallError(still_s, self._who_is_waited_for(now_s))
-
-    def _who_is_waited_for(self, now_s: float) -> str:
-        """Returns in words which processes everyone waits for: those that report nothing, not even that they wait."""
-        silent = [child for child in self._children if not child.is_member and now_s - child.heard_s > 2]
-        if not silent:
-            silent = [
-                child
-                for child in self._children
-                if child.is_member and child.done is None and now_s - child.heard_s > 2
-            ]
-        if silent:
-            return "everyone waits for " + few(
-                [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent]
-            )
-        members = self.plan.all_roles
-        waits = [
-            f"{child.name} for {few([members[source].name for source in child.waiting_for])}"
-            for child in self._children
-            if child.waiting_for
-        ]
-        return "all wait: " + few(waits, "; ")
-
-    def _stop_members(self) -> None:
-        """Ends the members of a run that broke off: terminates them, so that they can send their last batches, then kills."""
-        members = [child for child in self._children if child.is_member]
-        for child in members:
-            if child.process.is_alive():
-                child.process.terminate()
-        deadline_s = time.monotonic() + GRACE_S
-        # bridge and drives report their counts before they end, and their pipe must be read meanwhile
-        while time.monotonic() < deadline_s and any(
-            child.process.is_alive() and child.done is None for child in members
-        ):
-            try:
-                self._serve(0.05)
-            except (RunError, DivergedError):
-                pass  # why the run broke off is known already
-        for child in members:
-            if child.process.is_alive() and child.done is None:
-                child.process.kill()
-
-    def _finish_watchers(self, failure: str | None, broken: bool) -> str | None:
-        """Lets bridge, drives, referee and recorder finish, in this order; returns the failure, old or new.
-
-        A run that has `broken` off owes them messages that never come."""
-        links = [counts for child in self._children if child.done for counts in child.done.links]
-        sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
-        for child in self._children:
-            if child.done and child.done.runner:
-                sent[child.spec.kind] += child.done.runner.messages
-        for kind in FINISHING:
-            for child in self._children:
-                if (
-                    child.spec.kind != kind
-                    or child.is_member
-                    or not child.ready
-                    or child.control.closed
-                    or not child.process.is_alive()
-                ):
-                    continue
-                # On a wall clock, messages may be lost on the way.
-                whole = not broken and failure is None and self.virtual
-                order = Finish(
-                    links=tuple(links),
-                    robot_messages=sent["robot"] if whole else None,
-                    messages=sum(sent.values()) if whole else None,
-                )
-                try:
-                    child.control.send(order)
-                    begun_s = time.monotonic()
-                    patience_s = GRACE_S if failure else FINISH_TIMEOUT_S
-                    while child.done is None and child.process.is_alive() and time.monotonic() - begun_s < patience_s:
-                        self._serve(0.05)
-                        if not failure and time.monotonic() - begun_s > STALL_REPORT_S:
-                            self.progress.note = f"waits for {child.name} to finish ({child.state()})"
-                            self._show(self.progress)
-                except (RunError, DivergedError, OSError) as error:
-                    failure = failure or str(error)
-                if child.done is not None and isinstance(child.done.report, CanReport):
-                    sent["bridge"] = child.done.report.messages
-                if child.done is None:
-                    failure = failure or f"lost {kind} ({child.ending()}){self._words_of([child.name])}"
-        for child in self._children:
-            report = child.done and child.done.report
-            if isinstance(report, RecorderReport) and report.failure:
-                failure = failure or f"the recording failed: {report.failure}"
-        return failure
-
-    def _take_down(self) -> None:
-        """Ends all processes: sends `End` to those that are done, kills the others."""
-        for child in self._children:
-            if child.done is not None and not child.control.closed:
-                try:
-                    child.control.send(End())
-                except OSError:
-                    pass
-            elif child.process.is_alive():
-                child.process.terminate()
-        deadline_s = time.monotonic() + GRACE_S
-        for child in self._children:
-            child.process.join(max(0.0, deadline_s - time.monotonic()))
-            if child.process.is_alive():
-                child.process.kill()
-                child.process.join()
-            child.control.close()
-            child.words.close()
-
-    def _outcome(self, failure: str | None, startup_s: float, wall_s: float) -> Outcome:
-        processes = [child.done for child in self._children if child.done is not None]
-        can: CanReport | None = None
-        drives: DrivesReport | None = None
-        referee: RefereeReport | None = None
-        recorder: RecorderReport | None = None
-        for process in processes:
-            match process.report:
-                case CanReport():
-                    can = process.report
-                case DrivesReport():
-                    drives = process.report
-                case RefereeReport():
-                    referee = process.report
-                case RecorderReport():
-                    recorder = process.report
-        if can is not None:
-            can = replace(can if drives is None else can.with_drives(drives), referee=referee)
-        return Outcome(
-            trace=TraceBuilder(self.plan).build() if recorder is None else recorder.trace,
-            links=[counts for process in processes for counts in process.links],
-            processes=processes,
-            can=can,
-            startup_s=startup_s,
-            wall_s=wall_s,
-            messages=0 if recorder is None else recorder.messages,
-            failure=failure,
-            stopped=None if recorder is None else recorder.stopped(self.plan),
-        )
+    def _say(self, note: str) -> None:
+        """Shows a note to the user."""
+        self.progress.note = note
+        self._show(self.progress)
 
     def _tell_all(self, message: Told) -> None:
         for child in self._children:
@@ -450,12 +234,6 @@ class Supervisor:
                 child.control.send(message)
             except OSError:
                 pass  # the process is lost; `_check_lost` reports it
-
-
-def few(names: Sequence[str], between: str = ", ") -> str:
-    """Returns names as text, `NAMED` of them at most; the others are counted."""
-    more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
-    return between.join([*names[:NAMED], *more])
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -116,8 +116,8 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
 class RunRecorder:
     """Writes a run's ordered messages to run.mcap and into the trace.
 
-    Both end with the instant at which a robot's state is first not finite, unless the run is to `keep_going`: from then on
-    everything soon is not."""
+    Both end with the first instant at which a robot's state is not finite, since soon after that no state is.  With
+    `keep_going` they go on to the end."""
 
     def __init__(
         self,

@@ -1,1 +1,1 @@
-"""A run as an MCAP file: writing, reading, recovering.  Only this folder imports mcap."""
+"""Recordings of runs as MCAP files: writing, reading and recovering them.  Only this folder imports mcap."""

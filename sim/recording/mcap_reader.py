@@ -1,7 +1,7 @@
-"""Reading recordings, complete or cut off, and recovering those that were cut off.
+"""Reading recordings, and recovering those that are cut off.
 
-A file is read record by record from its start, so the file of a killed recorder can be read, too.  Any fault in the content
-of a file raises ValueError with one line that begins with its path.
+A file is read record by record from its start, so the file of a killed recorder can be read up to its end.  Any fault in the
+content of a file raises ValueError with a message of one line that begins with the file's path.
 """
 
 import struct
@@ -29,6 +29,7 @@ from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import CHUNK_SIZE, MAGIC, METADATA
 from echelon.sim.recording.recorder import LINKS, SCENARIO, state_topic, torque_topic
+from echelon.sim.recording.ros_definitions import schema_name, schema_text
 from echelon.sim.results.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
@@ -45,26 +46,29 @@ _READERS: Final = {
 
 
 class CutError(ValueError):
-    """The recording is cut off."""
+    """A recording is cut off: it ends before the end of its data."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecoverResult:
-    """The result of a recovery: number of messages, the run time of the last one [ns] (None if there are none), and the number
-    of damaged pieces that were left out; `complete` is true if nothing was missing."""
+    """The result of a recovery."""
 
     messages: int
+    """Number of recovered messages"""
     until_ns: int | None
+    """Run time of the last of these messages [ns]; None if there are none"""
     damaged: int
+    """Number of damaged records that were left out; a chunk of messages is one record"""
     complete: bool
+    """True if the file was neither cut off nor damaged"""
 
 
 def read_trace(path: Path, plan: Plan) -> Trace:
     """Returns the robots' states, bit for bit as they were recorded.
 
-    Raises ValueError if the file is cut off, damaged, not a recording, or not of this plan."""
+    Raises ValueError if the file is cut off, damaged, not a recording, or a recording of another plan."""
     topics = [state_topic(robot.path) for robot in plan.robots]
-    with _blame(path):
+    with blame(path):
         times_ns, states = _by_robot(path, topics, "RobotState", ros.robot_state(), len(STATE_FIELDS))
         return Trace(plan, times_ns, states)
 
@@ -73,9 +77,9 @@ def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArra
     """Returns the wanted torques of the robots on a closed path: for each robot its instants [ns], (T,), and the values of its
     messages, (T, len(TORQUE_FIELDS)).
 
-    Raises ValueError if the file is cut off, damaged, not a recording, or not of this plan."""
+    Raises ValueError if the file is cut off, damaged, not a recording, or a recording of another plan."""
     topics = [torque_topic(robot.path) for robot in plan.robots]
-    with _blame(path):
+    with blame(path):
         times_ns, torques = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), len(TORQUE_FIELDS))
         return list(zip(times_ns, torques, strict=True))
 
@@ -83,7 +87,9 @@ def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArra
 def _by_robot(
     path: Path, topics: Sequence[str], kind: str, splice: ros.Splice, width: int
 ) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.float64], ...]]:
-    """Returns times [ns] and values (`width` numbers per message) of the messages on topics, one topic for each robot."""
+    """Returns for each topic the instants [ns], (T,), and the values, (T, `width`), of its messages.
+
+    `topics` are by robot; `kind` is the type of the messages in echelon_msgs, and `splice` its encoder."""
     robots = {topic: robot for robot, topic in enumerate(topics)}
     prefix = len(splice.encode(ros.stamp(0), b""))
     times: list[list[int]] = [[] for _ in topics]
@@ -101,11 +107,11 @@ def _by_robot(
 
 
 def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
-    """Returns the counts of links, each with the run time [ns] at which it was taken, in the order of the recording.
+    """Returns the recorded counts of links, each with its run time [ns], in the order of the recording.
 
     Raises ValueError if the file is cut off, damaged or not a recording."""
     found = []
-    with _blame(path):
+    with blame(path):
         for _, time_ns, data in _messages(path, {LINKS}, "echelon_msgs/LinkStatistics"):
             at = len(ros.stamp(0)) + 8  # the empty frame_id
             source, receiver, channel = _LINK.unpack_from(data, at)
@@ -115,25 +121,25 @@ def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
 
 
 def read_scenario(path: Path) -> str:
-    """Returns the effective scenario as TOML, also from a file that is cut off.  Raises ValueError if there is none."""
-    with _blame(path):
-        for record in _records(path):
+    """Returns the effective scenario as TOML, also from a file that is cut off.  Raises ValueError if the file has none."""
+    with blame(path):
+        for record in records(path):
             if isinstance(record, Attachment) and record.name == SCENARIO:
                 return record.data.decode()
         raise ValueError(f"holds no {SCENARIO}")
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """Returns the recorder's metadata, also from a file that is cut off.  Raises ValueError if there are none."""
-    with _blame(path):
-        for record in _records(path):
+    """Returns the recorder's metadata, also from a file that is cut off.  Raises ValueError if the file has none."""
+    with blame(path):
+        for record in records(path):
             if isinstance(record, Metadata) and record.name == METADATA:
                 return record.metadata
         raise ValueError("holds no metadata of a run")
 
 
 def is_finished(path: Path) -> bool:
-    """Returns whether a file ends like a finished one: with the summary that lets readers seek in it."""
+    """Returns whether a file ends with the mark that stands behind the summary of a complete MCAP file.  Raises OSError."""
     with path.open("rb") as file:
         file.seek(-min(len(MAGIC), path.stat().st_size), SEEK_END)
         return file.read() == MAGIC
@@ -145,7 +151,7 @@ def recover(source: Path, target: Path) -> RecoverResult:
     `target` appears only when it is complete.  Raises ValueError if `source` is not an MCAP file, or is `target`, and OSError
     if `target` cannot be written."""
     partial = target.with_name(target.name + ".part")
-    with _blame(source):
+    with blame(source):
         if target.exists() and target.samefile(source):
             raise ValueError("cannot be mended in place; give another file to write to")
         try:
@@ -158,11 +164,12 @@ def recover(source: Path, target: Path) -> RecoverResult:
 
 
 def _copy(source: Path, writer: Writer) -> RecoverResult:
+    """Copies all undamaged records of a file."""
     schemas, channels = {0: 0}, dict[int, int]()
     messages, until_ns, damaged, complete = 0, None, list[str](), True
     writer.start("ros2", "echelon")
     try:
-        for record in _records(source, damaged):
+        for record in records(source, damaged):
             if isinstance(record, Schema) and record.id not in schemas:
                 schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
             elif isinstance(record, Channel) and record.id not in channels and record.schema_id in schemas:
@@ -184,28 +191,33 @@ def _copy(source: Path, writer: Writer) -> RecoverResult:
 
 
 def _messages(path: Path, topics: "dict[str, int] | set[str]", kind: str) -> Iterator[tuple[str, int, bytes]]:
-    """Yields topic, time [ns] and bytes of the messages on `topics`, which must be of the type `kind` of echelon_msgs."""
+    """Yields topic, time [ns] and bytes of the messages on `topics`, whose type must be `kind`, for example
+    `echelon_msgs/RobotState`.  Raises ValueError if the file has none of these topics, or their type is another one."""
     schemas, wanted = dict[int, Schema](), dict[int, str]()
-    for record in _records(path):
+    for record in records(path):
         if isinstance(record, Message):
             if record.channel_id in wanted:
                 yield wanted[record.channel_id], record.log_time, record.data
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel) and record.topic in topics:
-            schema = schemas.get(record.schema_id)
-            if schema is None or schema.name != ros.schema_name(kind) or schema.data != ros.schema_text(kind).encode():
-                raise ValueError(f"{record.topic} is not of the {ros.schema_name(kind)} known here")
+            check_type(record.topic, schemas.get(record.schema_id), kind)
             wanted[record.id] = record.topic
     if not wanted:
-        raise ValueError(f"holds no {ros.schema_name(kind)} of this plan")
+        raise ValueError(f"holds no {schema_name(kind)} of this plan")
 
 
-def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:
+def check_type(topic: str, schema: Schema | None, kind: str) -> None:
+    """Raises ValueError unless messages of this schema are of the type `kind` as it is known here."""
+    if schema is None or schema.name != schema_name(kind) or schema.data != schema_text(kind).encode():
+        raise ValueError(f"{topic} is not of the {schema_name(kind)} known here")
+
+
+def records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord]:
     """Yields schemas, channels, messages, attachments and metadata in the order of the file.
 
-    A damaged record raises ValueError; if `damaged` is given, it is skipped and noted there.  Raises CutError where the file
-    is cut off."""
+    Raises ValueError for a damaged record, unless `damaged` is given: then the record is skipped, and its error added to
+    `damaged`.  Raises CutError where the file is cut off."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -232,7 +244,7 @@ def _records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecor
 
 
 def _unpacked(opcode: int, body: bytes) -> list[McapRecord]:
-    """Returns the record, or the records in it if it is a chunk.  Raises ValueError if it is damaged."""
+    """Returns the record with this content; if it is a chunk, the records in it.  Raises ValueError if it is damaged."""
     try:
         if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]) != struct.unpack("<I", body[-4:])[0] != 0:
             raise ValueError("checksum")
@@ -268,8 +280,8 @@ def _message(body: bytes) -> Message:
 
 
 @contextmanager
-def _blame(path: Path) -> Iterator[None]:
-    """A context in which errors about a file become ValueError with its path in front, on one line."""
+def blame(path: Path) -> Iterator[None]:
+    """A context in which errors about the content of a file become ValueError of one line that begins with the file's path."""
     try:
         yield
     except CutError as error:

@@ -1,8 +1,9 @@
 """Writing an MCAP file: the same messages give the same bytes, and a killed recorder loses little (docs/architecture.md, 6.2).
 
-A chunk ends when it is full, never because of wall time, so that the bytes do not depend on the speed of the run.  The chunk in
-progress is written provisionally at short intervals of wall time, behind the last finished chunk; each later write overwrites
-it.  (A kill during such a write can cost the chunk.  A write takes some microseconds, ten times a second.)
+A chunk ends when it is full, never because of wall time, so the bytes do not depend on the speed of the run.  At short
+intervals of wall time the unfinished chunk is written provisionally, behind the last finished chunk; each later write
+overwrites it.  If the recorder is killed during such a write, the unfinished chunk may be lost.  A write takes some
+microseconds, ten times a second.
 """
 
 import fcntl
@@ -33,7 +34,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from echelon.sim.recording import ros
+from echelon.sim.recording.ros_definitions import schema_name, schema_text
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "echelon"
@@ -52,8 +53,8 @@ _INDEX: Final = struct.Struct("<BQHI")
 class ChunkedFile:
     """An MCAP file being written: definitions, then chunks of messages, then a summary.
 
-    After it is open it never raises OSError.  On an error it stops writing, and `failure` says why; the file then ends like
-    that of a killed recorder."""
+    Once it is open, no method raises OSError.  After an error nothing more is written, and `failure` says why; the file then
+    ends like that of a killed recorder."""
 
     def __init__(
         self, path: Path, attachments: dict[str, bytes], metadata: dict[str, str], topics: dict[str, str]
@@ -80,7 +81,7 @@ class ChunkedFile:
 
         types = list(dict.fromkeys(topics.values()))
         self._schemas = [
-            Schema(id=number, name=ros.schema_name(name), encoding="ros2msg", data=ros.schema_text(name).encode())
+            Schema(id=number, name=schema_name(name), encoding="ros2msg", data=schema_text(name).encode())
             for number, name in enumerate(types, 1)
         ]
         self._channels = [
@@ -98,7 +99,8 @@ class ChunkedFile:
         self._append(start + record + _records(*self._schemas, *self._channels))
 
     def add(self, channel: int, sequence: int, time_ns: int, data: bytes) -> None:
-        """Adds a message."""
+        """Adds a message on a channel at run time `time_ns`; `data` is the encoded message.  `sequence` is taken modulo
+        2^32."""
         buffer, entries = self._buffer, self._index[channel]
         entries.append(time_ns)
         entries.append(len(buffer))
@@ -108,7 +110,8 @@ class ChunkedFile:
             self._finish_chunk()
 
     def flush_if_due(self, monotonic_ns: int) -> None:
-        """Writes the chunk in progress provisionally if `FLUSH_NS` have passed since the last time."""
+        """Writes the unfinished chunk provisionally if `FLUSH_NS` have passed since the last time; `monotonic_ns` is wall
+        time."""
         if self._flushed_ns is not None and monotonic_ns - self._flushed_ns < FLUSH_NS:
             return
         self._flushed_ns = monotonic_ns
@@ -119,7 +122,7 @@ class ChunkedFile:
                 self._tail = tail
 
     def close(self) -> None:
-        """Writes the last chunk and the summary.  The file is then complete, unless there is a `failure`."""
+        """Writes the last chunk and the summary, and closes the file.  It is then complete, unless there was a `failure`."""
         if self._file < 0:
             return
         self._finish_chunk()
@@ -130,6 +133,7 @@ class ChunkedFile:
         self._file = -1
 
     def _chunk(self) -> Chunk:
+        """Returns the unfinished chunk."""
         times = [time for entries in self._index for time in (entries[:1] + entries[-2:-1])]
         return Chunk(
             "zstd",
@@ -141,7 +145,7 @@ class ChunkedFile:
         )
 
     def _finish_chunk(self) -> None:
-        """Writes the chunk in progress for the last time, with the index of its messages, and begins the next."""
+        """Writes the unfinished chunk for the last time, with the index of its messages, and begins the next chunk."""
         if self.failure is None and self._buffer:
             chunk = self._chunk()
             data, offsets = _records(chunk), {}
@@ -185,7 +189,9 @@ class ChunkedFile:
         return True
 
     def _write(self, data: bytes) -> bool:
-        """Writes behind the finished data, over the provisional chunk; returns whether it succeeded."""
+        """Writes data behind the finished data, over a provisional chunk; returns whether it succeeded.
+
+        If it fails, the provisional chunk that stood there is restored as far as possible."""
         try:
             _write_at(self._file, data, self._position)
             if len(data) < len(self._tail):
@@ -199,6 +205,7 @@ class ChunkedFile:
         return True
 
     def _summary(self) -> bytes:
+        """Returns the summary section, the footer and the mark at the end of the file."""
         counts = {channel: count for channel, count in enumerate(self._counts) if count}
         statistics = Statistics(
             attachment_count=sum(isinstance(index, AttachmentIndex) for index in self._indexes),
@@ -225,6 +232,7 @@ class ChunkedFile:
 
 
 def _records(*records: McapRecord) -> bytes:
+    """Returns records as bytes."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -233,6 +241,7 @@ def _records(*records: McapRecord) -> bytes:
 
 
 def _write_at(file: int, data: bytes, at: int) -> None:
+    """Writes all data at a place of a file.  Raises OSError."""
     rest = memoryview(data)
     while rest:
         written = os.pwrite(file, rest, at)

@@ -1,6 +1,6 @@
-"""The recorder: writes a run as an MCAP file that ROS viewers can open (docs/architecture.md, 6.2).
+"""The recorder: it writes a run as an MCAP file that ROS viewers can open (docs/architecture.md, 6.2).
 
-All times in the file are run times, so the same run gives the same bytes.
+All times in the file are run times, so that the same run gives the same bytes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +15,20 @@ from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import ChunkedFile
+from echelon.sim.recording.ros_definitions import ros_name
 from echelon.sim.recording.scene import DESIRED, Scene, desired
 
 SCENARIO: Final = "scenario.toml"
 """The name of the attachment that holds the effective scenario."""
 FRAMES, LINKS = "/can/frames", "/links"
 """Topics of frames and of counts of links.  With several buses, the topics of frames have their names: `/can/can1/frames`."""
+NULLS: Final = "/nulls"
+"""Topic of null messages: which source sent one, on which channel, and its number"""
 
 
 class Recorder:
-    """Writes the messages of a run and the ROS messages that show them.  Messages must come in order of time, then source."""
+    """Writes the messages of a run, and standard ROS messages that show the run in viewers.  Messages must come in order of
+    time, then source."""
 
     def __init__(
         self,
@@ -38,17 +42,17 @@ class Recorder:
 
         The scenario and the texts `part_files` (by name) become attachments; `metadata`, such as versions, become metadata."""
         self.null_messages = 0
-        """Number of null messages; they are not written."""
+        """Number of null messages"""
         self._plan = plan
         self._scene = Scene(plan)
-        topics, routes = _routes(plan)
+        topics, known = routes(plan)
         topics |= self._scene.topics | {DESIRED: "visualization_msgs/MarkerArray"}
         self._frame_topics = frame_topics(plan)
         topics |= dict.fromkeys(self._frame_topics, "can_msgs/Frame")
-        topics |= {LINKS: "echelon_msgs/LinkStatistics"}
+        topics |= {LINKS: "echelon_msgs/LinkStatistics", NULLS: "echelon_msgs/NullMessage"}
         self._numbers = {topic: number for number, topic in enumerate(topics, 1)}
         self._routes = {
-            key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in routes.items()
+            key: (self._numbers[topic], splice.size, splice.encode) for key, (topic, splice) in known.items()
         }
         attachments = {name: text.encode() for name, text in {SCENARIO: scenario_toml, **part_files}.items()}
         self._file = ChunkedFile(path, attachments, metadata, topics)
@@ -65,16 +69,18 @@ class Recorder:
         return self._file.failure
 
     def record(self, message: Message) -> None:
-        """Takes a message.  Raises ValueError for a wrong number of values."""
+        """Writes a message.  Raises ValueError if it has not the number of values that its channel has in the plan."""
         raw = message.values.tobytes()
-        if not raw:
-            self.null_messages += 1
-            return
+        self.null_messages += not raw
         if self._file.failure is not None:
             return
         if message.time_ns != self._now:
             self._advance(message.time_ns)
         source, channel = message.source, message.channel
+        if not raw:
+            null = ros.null_message(self._head, source, channel, message.sequence)
+            self._file.add(self._numbers[NULLS], self.null_messages - 1, self._now, null)
+            return
         number, size, encode = self._routes[16 * source + channel]
         if len(raw) != size:
             name = self._plan.all_roles[source].name
@@ -84,7 +90,7 @@ class Recorder:
             self._scene.states[source] = message.values
 
     def record_frame(self, timed: TimedFrame) -> None:
-        """Takes a CAN frame.  Frames from before run time 0 are not written; they are in can.log."""
+        """Writes a CAN frame.  Frames from before run time 0 are not written; they are in can.log."""
         time_ns, bus, _, (can_id, data, remote) = timed
         if self._file.failure is None and time_ns >= 0 and bus < len(self._frames):
             frame = ros.can_frame(ros.stamp(time_ns), can_id, data, remote)
@@ -92,7 +98,7 @@ class Recorder:
             self._frames[bus] += 1
 
     def record_links(self, time_ns: int, links: Sequence[LinkCounts]) -> None:
-        """Takes the counts of links at an instant."""
+        """Writes the counts of links at an instant."""
         members = self._plan.all_roles
         for counts in links if self._file.failure is None else ():
             name = f"{members[counts.source].name} to {members[counts.receiver].name}"
@@ -101,7 +107,8 @@ class Recorder:
             self._link_messages += 1
 
     def flush_if_due(self, monotonic_ns: int) -> None:
-        """Secures what was recorded so far against a kill; should be called at least ten times a second."""
+        """Writes to disk what was recorded so far, so that a kill does not cost it; should be called at least ten times a
+        second of wall time `monotonic_ns`."""
         self._file.flush_if_due(monotonic_ns)
 
     def close(self) -> None:
@@ -110,14 +117,14 @@ class Recorder:
         self._file.close()
 
     def _advance(self, time_ns: int) -> None:
-        """Ends the present instant, since all its messages have come, and shows it if that is due."""
+        """Begins a new instant: all messages of the last one have come, and the scene of it is written if that is due."""
         if time_ns > self._now:
             self._show()
         self._now = time_ns
         self._head = ros.stamp(time_ns)
 
     def _show(self) -> None:
-        """Writes the ROS messages that show the instant that ends, if that is due."""
+        """Writes the ROS messages that show the instant that ends, if `display_period_ns` have passed since the last time."""
         if self._now < self._next_display or self._file.failure is not None:
             return
         for topic, data in self._scene.messages(self._now):
@@ -127,14 +134,14 @@ class Recorder:
         self._next_display = (self._now // period + 1) * period
 
 
-def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
-    """Returns the types of all topics, and topic and encoder of each kind of message by 16 * source + channel."""
+def routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice]]]:
+    """Returns the types of all topics by topic, and the topic and encoder of each kind of message by 16 * source + channel."""
     topics: dict[str, str] = {}
-    routes: dict[int, tuple[str, ros.Splice]] = {}
+    found: dict[int, tuple[str, ros.Splice]] = {}
 
     def add(channel: Channel, source: int, topic: str, kind: str, splice: ros.Splice) -> None:
         topics[topic] = f"echelon_msgs/{kind}"
-        routes[16 * source + channel] = (topic, splice)
+        found[16 * source + channel] = (topic, splice)
 
     if plan.bridge is not None:
         for robot in plan.robots:
@@ -143,7 +150,7 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
     for robot in plan.robots:
         add(Channel.STATE, robot.index, state_topic(robot.path), "RobotState", ros.robot_state())
     for node in plan.nodes:
-        prefix = f"/{ros.ros_name(node.path)}/".replace("//", "/")
+        prefix = f"/{ros_name(node.path)}/".replace("//", "/")
         layout = NodeLayout.of(plan, node)
         if node.parent is not None:
             state = layout.state
@@ -154,21 +161,21 @@ def _routes(plan: Plan) -> tuple[dict[str, str], dict[int, tuple[str, ros.Splice
             add(Channel.REFERENCE, node.index, prefix + "reference", "Reference", encoder)
         if (command := layout.command) is not None:
             add(Channel.COMMAND, node.index, prefix + "command", "Command", ros.command(length(command.accelerations)))
-    return topics, routes
+    return topics, found
 
 
 def frame_topics(plan: Plan) -> list[str]:
-    """Returns the topics of the frames, one for each bus."""
+    """Returns the topics of CAN frames, one for each bus in the order of the plan."""
     if len(plan.can.buses) == 1:
         return [FRAMES]
-    return [f"/can/{ros.ros_name(bus.name)}/frames" for bus in plan.can.buses]
+    return [f"/can/{ros_name(bus.name)}/frames" for bus in plan.can.buses]
 
 
 def state_topic(path: str) -> str:
-    """Returns the topic of a robot's state."""
-    return f"/{ros.ros_name(path)}/state"
+    """Returns the topic of the state of the robot with this path in the tree."""
+    return f"/{ros_name(path)}/state"
 
 
 def torque_topic(path: str) -> str:
-    """Returns the topic of the torques that a robot wants, on a closed torque path."""
-    return f"/{ros.ros_name(path)}/torque"
+    """Returns the topic of the wanted torques of the robot with this path, on a closed torque path."""
+    return f"/{ros_name(path)}/torque"

@@ -1,8 +1,8 @@
-"""ROS 2 messages as bytes: definitions (ros2msg) and encoders (CDR, little endian).
+"""ROS 2 messages as bytes: encoders (CDR, little endian).
 
 A CDR message is four bytes of encapsulation, then its fields.  A number stands at a multiple of its size, counted from the end
-of the encapsulation.  Messages that are written thousands of times a second have a constant size.  So their bytes are laid out
-once (`Layout`); for each message, stamp and float64 values are put into their places.
+of the encapsulation.  The messages that are written most often have a constant size.  So their bytes are laid out once
+(`Layout`), and an encoder only puts the stamp and the float64 values of each message into their places.
 """
 
 import struct
@@ -22,80 +22,6 @@ WORLD: Final = "world"
 """The frame of reference of all positions."""
 ARROW, SPHERE, LINE_STRIP = 0, 2, 4
 
-_HEADER: Final = "std_msgs/Header header\n"
-_MARKER_KINDS: Final = (
-    *("ARROW", "CUBE", "SPHERE", "CYLINDER", "LINE_STRIP", "LINE_LIST", "CUBE_LIST", "SPHERE_LIST", "POINTS"),
-    *("TEXT_VIEW_FACING", "MESH_RESOURCE", "TRIANGLE_LIST"),
-)
-_MARKER_CONSTANTS: Final = "".join(f"int32 {name}={value}\n" for value, name in enumerate(_MARKER_KINDS))
-DEFINITIONS: Final = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec\n",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-    "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
-    "geometry_msgs/TransformStamped": _HEADER + "string child_frame_id\ngeometry_msgs/Transform transform\n",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
-    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
-    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
-    "sensor_msgs/CompressedImage": _HEADER + "string format\nuint8[] data\n",
-    "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v\n",
-    "visualization_msgs/MeshFile": "string filename\nuint8[] data\n",
-    "visualization_msgs/Marker": (
-        _MARKER_CONSTANTS + "int32 ADD=0\nint32 MODIFY=0\nint32 DELETE=2\nint32 DELETEALL=3\n" + _HEADER + "string ns\n"
-        "int32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 scale\n"
-        "std_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool frame_locked\n"
-        "geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\n"
-        "sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\nstring text\n"
-        "string mesh_resource\nvisualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials\n"
-    ),
-    "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers\n",
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-    "nav_msgs/Odometry": _HEADER + "string child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-    "geometry_msgs/TwistWithCovariance twist\n",
-    "sensor_msgs/JointState": _HEADER + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
-    "can_msgs/Frame": _HEADER + "uint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n",
-    "echelon_msgs/RobotState": _HEADER + "".join(f"float64 {name}\n" for name in STATE_FIELDS),
-    "echelon_msgs/GroupState": _HEADER
-    + "".join(f"float64 {name}\n" for name in GROUP_FIELDS)
-    + "float64[] error_rates\nfloat64[] positions\n",
-    "echelon_msgs/Reference": _HEADER + "float64[] accelerations\nfloat64[] error_rates\nfloat64[] forces\n",
-    "echelon_msgs/Command": _HEADER + "float64[] accelerations\n",
-    "echelon_msgs/WheelTorque": _HEADER + "".join(f"float64 {name}\n" for name in TORQUE_FIELDS),
-    "echelon_msgs/Wheels": _HEADER + "float64[] torques\n",
-    "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
-    "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
-    "float64 age_mean_ns\nint64 age_max_ns\n",
-}
-"""Message definitions by name, without the middle part `msg`.  Types of fields are written with their package."""
-
-
-def ros_name(path: str) -> str:
-    """Returns a path of names as a valid ROS name, in which hyphens are not allowed: `g-1/r2` becomes `g_1/r2`."""
-    return path.replace("-", "_")
-
-
-def schema_name(name: str) -> str:
-    """Returns a type's name with the middle part `msg`: `nav_msgs/Odometry` becomes `nav_msgs/msg/Odometry`."""
-    return name.replace("/", "/msg/")
-
-
-def schema_text(name: str) -> str:
-    """Returns a definition followed by those of all types in it: the format ros2msg."""
-    parts, found, waiting = [DEFINITIONS[name]], {name}, [name]
-    while waiting:
-        for line in DEFINITIONS[waiting.pop(0)].splitlines():
-            used = line.split(" ")[0].partition("[")[0]
-            if used in DEFINITIONS and used not in found:
-                found.add(used)
-                waiting.append(used)
-                parts.append(f"MSG: {used}\n{DEFINITIONS[used]}")
-    return f"{'=' * 80}\n".join(parts)
-
 
 def stamp(time_ns: int) -> bytes:
     """Returns the beginning of a message with a header: encapsulation and stamp, 12 bytes."""
@@ -103,12 +29,15 @@ def stamp(time_ns: int) -> bytes:
 
 
 class Layout:
-    """A message that is laid out field by field, with the places of stamps and float64 values."""
+    """The layout of a message, made field by field."""
 
     def __init__(self) -> None:
         self.body = bytearray()
+        """The bytes behind the encapsulation, zero where values are filled in later"""
         self.stamps: list[int] = []
+        """Places of the stamps in `body`"""
         self.places: list[int] = []
+        """Places of the float64 values that are filled in later, in `body`"""
 
     def put(self, code: str, *values: float) -> "Layout":
         """Adds numbers of one type, given as a code of `struct`."""
@@ -142,7 +71,7 @@ class Layout:
 
 
 class Template:
-    """A laid-out message into which all stamps and all float64 values are put."""
+    """An encoder of messages with one layout that puts in all stamps and all float64 values."""
 
     def __init__(self, layout: Layout) -> None:
         size = 8 + len(layout.body)
@@ -157,23 +86,23 @@ class Template:
         self._places = np.array(layout.places, int) // 8 + 1
 
     def encode(self, time_ns: int, values: Array) -> bytes:
-        """Returns the message; `values` fill the places of the layout in its order."""
+        """Returns the message; `values` (n,) fill the n places of the layout in their order."""
         self._words[self._seconds], self._words[self._nanoseconds] = divmod(time_ns, 1_000_000_000)
         self._doubles[self._places] = values
         return self._message.tobytes()
 
 
 class Splice:
-    """A laid-out message that begins with a header and gets its float64 values as bytes, in order.
+    """An encoder of messages with one layout that begins with a header; it takes the float64 values as bytes, in order.
 
-    It is faster than `Template`, since it only joins constant bytes and pieces of these bytes."""
+    It is faster than `Template`, since it only joins constant bytes and pieces of the given bytes."""
 
     def __init__(self, layout: Layout) -> None:
         starts = [at for at in layout.places if at - 8 not in layout.places]
         ends = [at + 8 for at in layout.places if at + 8 not in layout.places]
         body = bytes(layout.body)
         self.size = 8 * len(layout.places)
-        """Number of bytes of values in a message."""
+        """Number of bytes of values in a message"""
         self._first = body[8 : starts[0]]
         self._end = ends[0] - starts[0]
         self._rest: list[tuple[bytes, int, int]] = []
@@ -192,6 +121,22 @@ class Splice:
             message += constant + values[start:end]
         return message
 
+    def decode(self, message: bytes) -> bytes:
+        """Returns the values of a message that `encode` made.  Raises ValueError if its size or a constant part is another."""
+        at = len(stamp(0)) + len(self._first)
+        size = at + self.size + sum(len(constant) for constant, _, _ in self._rest)
+        if len(message) != size:
+            raise ValueError(f"has {len(message)} bytes, not {size}")
+        values = message[at : at + self._end]
+        at += self._end
+        for constant, start, end in self._rest:
+            if message[at : at + len(constant)] != constant:
+                raise ValueError("has an array of another length")
+            at += len(constant)
+            values += message[at : at + end - start]
+            at += end - start
+        return values
+
 
 def robot_state() -> Splice:
     """Returns the encoder of echelon_msgs/RobotState; its values are `STATE_FIELDS`."""
@@ -209,7 +154,7 @@ def reference(accelerations: int, error_rates: int, forces: int) -> Splice:
 
 
 def command(accelerations: int) -> Splice:
-    """Returns the encoder of echelon_msgs/Command."""
+    """Returns the encoder of echelon_msgs/Command; its values are accelerations."""
     return Splice(Layout().header(WORLD).holes(accelerations))
 
 
@@ -219,7 +164,7 @@ def wheel_torque() -> Splice:
 
 
 def wheels(torques: int) -> Splice:
-    """Returns the encoder of echelon_msgs/Wheels."""
+    """Returns the encoder of echelon_msgs/Wheels; its values are torques, two for each robot."""
     return Splice(Layout().header("").holes(torques))
 
 
@@ -249,7 +194,8 @@ def joint_state(names: Sequence[str]) -> Template:
 
 
 def markers(count: int) -> Layout:
-    """Returns the layout of a visualization_msgs/MarkerArray; exactly `count` markers must follow by `add_marker`."""
+    """Returns the beginning of the layout of a visualization_msgs/MarkerArray.  `add_marker` must then be called `count`
+    times."""
     return Layout().put("I", count)
 
 
@@ -262,7 +208,10 @@ def add_marker(
     color: tuple[float, float, float, float],
     points: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Adds a marker in the frame `WORLD`; its values are x, y, q_z, q_w, or none if it has points."""
+    """Adds a marker in the frame `WORLD`.  Its values are x, y, q_z, q_w; a marker with points [m] has no values.
+
+    `number` tells it apart from others in the namespace; `kind` is `ARROW`, `SPHERE` or `LINE_STRIP`; `scale` is in metres,
+    `color` is red, green, blue, opacity from 0 to 1."""
     layout.header(WORLD).string(namespace).put("i", number, kind, 0)
     if points:
         layout.put("d", *[0.0] * 6, 1.0)
@@ -280,7 +229,7 @@ _FRAME: Final = struct.Struct("<I4xIBBBB8s")  # an empty frame_id, padded to a m
 
 
 def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> bytes:
-    """Returns a can_msgs/Frame; identifiers above 11 bits make it an extended one.  `head` is from `stamp`.
+    """Returns a can_msgs/Frame; with an identifier of more than 11 bits it is an extended frame.  `head` is from `stamp`.
 
     Raises ValueError if `data` is longer than eight bytes."""
     if len(data) > 8:
@@ -288,8 +237,18 @@ def can_frame(head: bytes, can_id: int, data: bytes, remote: bool = False) -> by
     return head + _FRAME.pack(1, can_id, remote, can_id > 0x7FF, False, len(data), data)
 
 
+NULL_MESSAGE: Final = struct.Struct("<I4xIB3xQ")
+"""Of an echelon_msgs/NullMessage what follows the stamp: an empty frame_id, padded to a multiple of four; source, channel,
+sequence number"""
+
+
+def null_message(head: bytes, source: int, channel: int, sequence: int) -> bytes:
+    """Returns an echelon_msgs/NullMessage.  `head` is from `stamp`."""
+    return head + NULL_MESSAGE.pack(1, source, channel, sequence)
+
+
 def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:
-    """Returns an echelon_msgs/LinkStatistics; `name` is the link in words."""
+    """Returns an echelon_msgs/LinkStatistics; `name` says which link it is, for people."""
     layout = Layout().header("").put("I", counts.source, counts.receiver).put("B", counts.channel).string(name)
     layout.put("Q", counts.sent, counts.delivered, counts.lost, counts.in_flight, counts.used, counts.held)
     layout.put("d", counts.age_mean_ns).put("q", counts.age_max_ns)

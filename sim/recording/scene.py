@@ -1,4 +1,4 @@
-"""The scene of a run for viewers: frames of reference, odometry, wheels, and markers of robots and groups."""
+"""The scene of a run for ROS viewers: transforms, odometry, wheels, and markers of robots and centroids."""
 
 from math import isfinite
 from typing import Final
@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from echelon.messages import STATE_FIELDS, Values
 from echelon.plan.plan import NodePlan, Plan
 from echelon.sim.recording import ros
+from echelon.sim.recording.ros_definitions import ros_name
 from echelon.sim.results.desired import Desired
 
 Array = NDArray[np.float64]
 
 TF, MARKERS, DESIRED, JOINT_STATES = "/tf", "/markers", "/desired", "/joint_states"
 DESIRED_POINTS: Final = 500
+"""Points of the line that shows the desired trajectory"""
 GREY: Final = (0.6, 0.6, 0.6, 1.0)
 COLORS: Final = (
     (0.12, 0.47, 0.71, 1.0),
@@ -26,13 +28,14 @@ COLORS: Final = (
     (0.89, 0.47, 0.76, 1.0),
     (0.09, 0.75, 0.81, 1.0),
 )
-"""Colours of the groups, used in turn; the formation itself is grey."""
+"""Colours of the groups, used in turn; the root of a formation with groups is grey."""
 
 
 class Scene:
-    """The last states of a plan's robots, and the ROS messages that show them.
+    """The latest states of all robots, and the ROS messages that show them.
 
-    `states` has a row of `STATE_FIELDS` for each robot; before its first message a robot is at its start."""
+    `states` has for each robot its latest state (`STATE_FIELDS`), which the recorder replaces; before the first one a robot
+    stands at its start."""
 
     def __init__(self, plan: Plan) -> None:
         self.states: list[Values] = []
@@ -42,9 +45,9 @@ class Scene:
             self.states.append(state)
         self.topics = {TF: "tf2_msgs/TFMessage", MARKERS: "visualization_msgs/MarkerArray"}
         self.topics |= {JOINT_STATES: "sensor_msgs/JointState"}
-        names = [ros.ros_name(robot.path) for robot in plan.robots]
+        names = [ros_name(robot.path) for robot in plan.robots]
         self.topics |= {f"/{name}/odom": "nav_msgs/Odometry" for name in names}
-        """The types of the topics of `messages`, by topic."""
+        """Types of the messages that `messages` returns, by topic"""
         self._arm = np.array([robot.arm for robot in plan.robots])
         self._offset = np.array([robot.offset for robot in plan.robots])
         self._wheel_radius = np.array([robot.wheel_radius for robot in plan.robots])
@@ -57,7 +60,8 @@ class Scene:
         self._markers = _markers(plan)
 
     def messages(self, time_ns: int) -> list[tuple[str, bytes]]:
-        """Returns topic and bytes of each message that shows the present states; values that are not finite are kept."""
+        """Returns topic and bytes of each message that shows the latest states at `time_ns`.  Values that are not finite are
+        written as they are."""
         states = np.array(self.states)
         x, y, vx, vy, theta, v, omega, _, _, tau_right, tau_left = states.T[:11]
         with np.errstate(all="ignore"):
@@ -86,7 +90,8 @@ class Scene:
 
 
 def desired(plan: Plan) -> bytes:
-    """Returns the whole desired trajectory of the centroid as a line, a message of time 0 that never changes."""
+    """Returns the marker array that shows the whole desired trajectory of the centroid as a line.  It is written once, at time
+    0."""
     places = Desired(plan).sample(np.linspace(0.0, plan.duration_ns / 1e9, DESIRED_POINTS))[:, 0]
     points = [(x, y) for x, y in places.tolist() if isfinite(x) and isfinite(y)]
     layout = ros.markers(1)
@@ -95,7 +100,7 @@ def desired(plan: Plan) -> bytes:
 
 
 def _size(plan: Plan) -> float:
-    """Returns the size of centroids in the scene [m]: that of a typical robot."""
+    """Returns the diameter of a centroid's sphere [m]: the track of a typical robot."""
     return float(np.median([2 * robot.arm for robot in plan.robots]))
 
 

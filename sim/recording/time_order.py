@@ -1,4 +1,4 @@
-"""Putting the messages of many sources into one order of time, whatever the order of arrival."""
+"""Putting the messages of many sources in order of time, whatever their order of arrival."""
 
 from collections.abc import Iterable
 from typing import Final
@@ -10,31 +10,29 @@ _BEFORE_ALL_NS: Final = -(1 << 62)
 
 
 def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
-    """Returns the indices of the roles whose messages are recorded: robots and nodes, then the bridge, then the drives.
-
-    Drives send messages of their own only in virtual time."""
+    """Returns the indices of the roles whose messages are recorded, a range from 0: robots and nodes, then the bridge if it
+    makes frames, then the drives.  Drives send messages of their own only on a closed torque path in virtual time."""
     if not plan.can.closed:
         return range(len(plan.formation) + has_bus)
     return range(len(plan.all_roles) if virtual else len(plan.formation) + 1)
 
 
 class TimeOrder:
-    """Orders messages by (time, source, channel).  A message is released when every source has sent a later one.
+    """Releases messages in the order (time, source, channel): each when every source has sent a later message.
 
-    Each source sends in order of time.  The order of the released messages does not depend on the order of arrival.
-    """
+    Each source must send in order of time.  The order of the released messages does not depend on the order of arrival."""
 
     def __init__(self, sources: Iterable[int]) -> None:
         self._latest = dict.fromkeys(sources, _BEFORE_ALL_NS)
         self._waiting: dict[int, list[Message]] = {}
         self._released_ns = _BEFORE_ALL_NS
         self.pushed = 0
-        """Number of accepted messages."""
+        """Number of accepted messages"""
         self.refused = 0
-        """Number of messages from unknown sources, or older than released ones."""
+        """Number of refused messages: from an unknown source, or not later than the last released one"""
 
     def push(self, messages: list[Message]) -> list[Message]:
-        """Takes messages, in order for each source; returns the released ones in the common order."""
+        """Takes messages, in order of time for each source; returns the messages that are released now, in the common order."""
         waiting, latest = self._waiting, self._latest
         for message in messages:
             time_ns = message.time_ns
@@ -52,11 +50,11 @@ class TimeOrder:
         return self._release(min(latest.values()))
 
     def rest(self) -> list[Message]:
-        """Returns the remaining messages in order.  The end of a run needs it, since no source sends anything later then."""
+        """Returns the messages that wait, in order.  For the end of a run: then no source sends a later message."""
         return self._release(1 << 63)
 
     def _release(self, safe_ns: int) -> list[Message]:
-        """Releases everything before `safe_ns`."""
+        """Releases all messages before `safe_ns`."""
         released: list[Message] = []
         for time_ns in sorted(time_ns for time_ns in self._waiting if time_ns < safe_ns):
             bucket = self._waiting.pop(time_ns)

@@ -1,6 +1,6 @@
-"""The report of a run: one HTML page with figures.  Where matplotlib is imported."""
+"""The report of runs: one HTML page with figures.  Only this folder imports matplotlib."""
 
 import logging
 
-# matplotlib keeps a list of fonts on disk.  Without room for that it works all the same; its warning would hide our one line.
+# matplotlib stores a list of fonts on disk.  It works without it, too; on a full disk its warning would hide our own message.
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)

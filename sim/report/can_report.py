@@ -1,4 +1,4 @@
-"""The part of a report that concerns the CAN buses: load, latencies, torques that were stopped, drives, the referee."""
+"""The report's section about the CAN buses: load, latencies, stopped torques, drives, the referee."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -9,16 +9,18 @@ from echelon.sim.report.page import paragraph, rest, subheading, table
 from echelon.sim.results.summary import number
 
 MAX_ROWS: Final = 60
-"""Rows of a table; what is beyond is in summary.json."""
+"""Rows of a table; the rest is in summary.json."""
 SIMPLE: Final = ("url", "listen", "path", "timing", "torque_scale", "frames", "sent", "failed", "dropped", "foreign")
-"""What is shown as it stands."""
+"""Fields of `CanReport` that are shown as they are"""
 
 
 def can_section(can: CanReport | None, frames: Sequence[Mapping[str, object]]) -> str:
-    """Returns the section of one run, HTML; `frames` are the first ones, decoded."""
+    """Returns the section about one run as HTML; `frames` are the first frames, decoded, all with the same keys."""
     if can is None or not can.frames:
         return paragraph("No bus in this run.")
     text = paragraph(" ".join(_sentences(can)))
+    if can.referee is not None and can.referee.after_stop:
+        text += paragraph(f"{can.referee.after_stop}.".capitalize())
     text += "".join(paragraph(f"{line}.") for line in can.fit)
     text += table(["", ""], [[key.replace("_", " "), _plain(getattr(can, key))] for key in SIMPLE], numeric_from=2)
     if can.advice:
@@ -54,7 +56,7 @@ def _sentences(can: CanReport) -> list[str]:
 
 def _referee(referee: RefereeReport) -> str:
     found = ", ".join(f"{count} {kind}" for kind, count in referee.kinds.items()) or "nothing wrong"
-    words = subheading("Referee") + paragraph(f"It looked at {referee.frames} frames{referee.up_to} and found {found}.")
+    words = subheading("Referee") + paragraph(f"Frames{referee.up_to}: {referee.frames}. Found: {found}.")
     rows = [[f"{row.time:.6g}", row.bus, row.id, row.robot, row.kind, row.text] for row in referee.findings[:MAX_ROWS]]
     if not rows:
         return words
@@ -63,7 +65,7 @@ def _referee(referee: RefereeReport) -> str:
 
 
 def _happened(can: CanReport) -> str:
-    """Returns what was on schedule, and which controllers left their bus, in order of time."""
+    """Returns a table of scheduled events and of events on the buses, bus-off for example, in order of time."""
     rows = [
         (event.time, "scheduled", ", ".join(event.whom), event.what + _until(event.until)) for event in can.scheduled
     ]

@@ -1,4 +1,4 @@
-"""Several runs in the same figures: paths, errors, distances and torques, a colour and dashes for each run."""
+"""Figures that compare several runs: paths, errors, distances and torques.  Each run has its own colour and dashes."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -8,15 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from echelon.sim.report.drawing import Look, Picture, TimeAxis, drawable
-from echelon.sim.report.figures import (
+from echelon.sim.report.axes import (
     CALM_DISTANCE,
     CALM_TORQUE,
     SMALL_MULTIPLES,
     TAUS,
     TorqueScale,
-    X,
-    Y,
     as_map,
     distance_limits,
     distance_time,
@@ -29,18 +26,21 @@ from echelon.sim.report.figures import (
     small_multiples,
     torque_time,
 )
+from echelon.sim.report.drawing import Look, Picture, drawable
+from echelon.sim.report.time_axis import TimeAxis
+from echelon.sim.report.trajectory_map import X, Y
 from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.trace import Trace
 
 Kind = TypeVar("Kind")
 WIDTH: Final = 11.5
-"""Of all figures [inches]"""
+"""Width of a figure [inches]"""
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A run among others: its name, what was recorded, and what was computed from it."""
+    """A run in a comparison: its name, its trace, and what is computed from the trace."""
 
     name: str
     trace: Trace
@@ -69,7 +69,7 @@ def comparison(runs: Sequence[Compared]) -> dict[str, tuple[Picture, str]]:
 
 
 def longest(times: Sequence[TimeAxis]) -> TimeAxis:
-    """Returns the time axis that shows all runs, logarithmic if any of theirs is."""
+    """Returns the time axis that shows all runs; it is logarithmic if that of one run is."""
     log = any(time.log for time in times)
     end = max(time.end for time in times)
     last = end if log else max(time.last for time in times)

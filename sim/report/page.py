@@ -1,4 +1,5 @@
-"""The report's page: HTML of headings, tables, figures and verdicts, styled by page.css; text is escaped here."""
+"""The HTML of a report's page: headings, tables, figures and verdicts, with the style of page.css.  Only this module escapes
+text."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -10,17 +11,17 @@ from echelon.sim.results.records import Summary
 from echelon.sim.results.summary import number
 
 OUTCOMES: Final = {"passed": "holds", "failed": "fails", "not tested": "quiet"}
-"""How the outcome of a check is marked in a table"""
+"""The CSS class of an outcome in a table"""
 LONG: Final = 24
-"""A table's text of more characters may take several lines."""
+"""A text in a table with more characters than this may take several lines."""
 FOLDED: Final = 12
-"""A table of more rows is folded."""
+"""A table with more rows than this is folded."""
 GENERATOR: Final = '<meta name="generator" content="echelon">'
-"""By which a report is known to be one"""
+"""A tag in the page's head by which programs recognise a report"""
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """Returns a whole document that needs nothing but itself."""
+    """Returns a complete HTML document that needs no other files."""
     style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -32,13 +33,13 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def header(heading: str, description: str, facts: Sequence[str]) -> str:
-    """Returns the page's head: what it is about, in a sentence, and a line of facts."""
+    """Returns the page's head: a heading, a description (may be empty), and a line of facts."""
     lead = f'<p class="lead">{escape(description)}</p>' if description else ""
     return f'<header><h1>{escape(heading)}</h1>{lead}<p class="quiet">{escape(" · ".join(facts))}</p></header>'
 
 
 def side_by_side(cells: Sequence[str]) -> str:
-    """Returns cells beside each other where there is room."""
+    """Returns cells (HTML) beside each other if the page is wide enough, otherwise below each other."""
     if len(cells) == 1:
         return cells[0]
     pair = " pair" if len(cells) == 2 else ""
@@ -56,7 +57,7 @@ def paragraph(text: str) -> str:
 
 
 def section(heading: str, text: str, cells: Sequence[str]) -> str:
-    """Returns a section: heading, a word of explanation, and its cells side by side where there is room."""
+    """Returns a section: a heading, an explanation (may be empty), and cells (HTML) side by side."""
     words = f'<p class="quiet">{escape(text)}</p>' if text else ""
     return f"<section><h2>{escape(heading)}</h2>{words}{side_by_side(cells)}</section>"
 
@@ -68,7 +69,7 @@ def figure(picture: Picture, alternative: str, caption: str) -> str:
 
 
 def verdict(name: str, summary: Summary) -> str:
-    """Returns a run's verdict with its reasons, and what was not tested."""
+    """Returns a run's verdict with its reasons, and with the checks that were not tested."""
     found = summary.verdict
     listed = "".join(f"<li>{escape(reason)}</li>" for reason in found.reasons)
     listed += "".join(f'<li class="quiet">not tested: {escape(text)}</li>' for text in found.not_tested)
@@ -81,7 +82,7 @@ def verdict(name: str, summary: Summary) -> str:
 
 
 def tiles(values: Sequence[tuple[str, str]]) -> str:
-    """Returns the few numbers people look for first: what, how much."""
+    """Returns a row of tiles, each with a word and a number: those that people look for first."""
     return (
         '<div class="tiles">'
         + "".join(
@@ -93,14 +94,15 @@ def tiles(values: Sequence[tuple[str, str]]) -> str:
 
 
 def fold(words: str, content: str) -> str:
-    """Returns what is shown once it is unfolded."""
+    """Returns content (HTML) that the reader unfolds by a click on `words`."""
     return f"<details><summary>{escape(words)}</summary>{content}</details>"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: int = 1, what: str = "rows") -> str:
-    """Returns a table; columns from `numeric_from` on are aligned right, None is a dash, True and False are words.
+    """Returns a table.  Columns from number `numeric_from` on are aligned right; None becomes a dash, True `holds`, False
+    `fails`.
 
-    A long one is folded, and says how many of `what` are in it."""
+    A table of more than `FOLDED` rows is folded, under words such as `60 robots`, where `what` is `robots`."""
 
     def cell(at: int, value: object) -> str:
         if isinstance(value, bool):
@@ -120,10 +122,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], numeric_from: i
 
 
 def rest(count: int, shown: int) -> str:
-    """Returns how many rows a table of `count` lacks because it shows `shown` at most."""
+    """Returns a paragraph that says how many rows a table leaves out that shows at most `shown` of `count`; empty if none."""
     return paragraph(f"{count - shown} more are in the summary.") if count > shown else ""
 
 
 def preformatted(text: str) -> str:
-    """Returns text as it stands."""
+    """Returns text with its line breaks and spaces."""
     return f"<pre>{escape(text.strip())}</pre>"

@@ -1,22 +1,23 @@
-"""Where torques step up and down by the resolution of their frames, which draws a band instead of a line."""
+"""Torques that step up and down by the resolution of their frames, so that a figure shows a band instead of a line."""
 
 from typing import Final
 
 import numpy as np
 
 from echelon.bridge.protocols.registry import protocol_of
-from echelon.sim.report.figures import TAUS
+from echelon.sim.report.axes import TAUS
 from echelon.sim.results.can_lines import some
 from echelon.sim.results.trace import Trace
 
 SHARE: Final = 0.1
-"""Of a robot's periods in which a torque steps by one or two, at least, for it to be told"""
+"""Share of the periods in which a torque must change by one or two steps to be mentioned"""
 
 
 def steps_text(trace: Trace) -> str:
-    """Returns whose torques step by the resolution of their frames, and by how much; empty if none do.
+    """Returns sentences that name the robots whose torques step by the resolution of their frames, and the step [N m].
 
-    They do on a closed torque path alone: there a wheel has what its frames carry."""
+    Returns an empty text if there are none, and on the mirrored torque path: only on a closed path the wheels get their torques
+    from frames."""
     if not trace.plan.can.closed:
         return ""
     found: dict[float, list[str]] = {}

@@ -1,1 +1,1 @@
-"""What a run was: its trace, what is measured of it, and the summary."""
+"""The results of a run: its trace, what is computed from it, the checks with the verdict, and the summary."""

@@ -1,10 +1,10 @@
-"""How old what a node acts on is, and the error that this leaves in a moving formation.
+"""How old the states are that nodes use, and the steady error that these ages cause in a moving formation.
 
-The state of t - τ is compared with the reference of t.  Where the formation moves with the velocity v, that is a constant
-error of the measured position, -v τ, and the law takes it away: the formation stands v τ ahead of its reference.  It is no
-instability (docs/architecture.md, 2.10).  Robots of different ages are moved apart in the same way: with the mean ages τ_k of
-what a node knows of its children, a shape variable z of that node is off by v (Φ_node τ)_z, and the centroid by v times the
-mean of the root's τ_k.
+A node compares states of t - τ with the reference of t.  If the formation moves with the velocity v, the measured position is
+wrong by -v τ, and the law makes up for this: the formation stands v τ ahead of its reference.  This is a steady error, not an
+instability (docs/architecture.md, 2.10).  If a node's children have different ages, the shape is wrong, too: with the mean ages
+τ = (τ_1, τ_2, …) of the states of its children, its shape variable z is off by v (Φ_node τ)_z, and the centroid of the
+formation by v times the weighted mean of the root's τ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,10 +23,11 @@ DOWN: Final = (Channel.REFERENCE, Channel.COMMAND)
 
 
 def lag_times(plan: Plan, links: Sequence[LinkCounts]) -> Mapping[str, Array]:
-    """Returns for each block the times [s], (size/2,), by which its variables are off per velocity [m per m/s]."""
+    """Returns for each block the times [s], (size/2,), by which the velocity is multiplied to give the steady errors of its
+    variables.  A link without a used message counts with the age 0."""
     age = {(link.source, link.receiver): link.age_mean_ns / 1e9 for link in links if link.channel in UP and link.used}
     below: dict[int, float] = {}
-    """Of what a node tells: how old the robots' states in it are in the mean"""
+    """By node: the weighted mean age [s] of the robots' states in its group's state when the node computes it"""
     times: dict[int, Array] = {}
     for node in plan.nodes:
         ages = np.array([age.get((child, node.index), 0.0) + below.get(child, 0.0) for child in node.children])
@@ -39,9 +40,9 @@ def lag_times(plan: Plan, links: Sequence[LinkCounts]) -> Mapping[str, Array]:
 
 
 def loop_jitter(plan: Plan, links: Sequence[LinkCounts]) -> float:
-    """Returns how much the age of what goes from a robot to the root and back varies about its mean [s], of the robot for
-    which that is most.  Of one link it is what the largest age is above the mean, but no more than twice the mean: the
-    largest of many ages says little about most of them."""
+    """Returns how much later than on average a message can go from a robot to the root and back [s]: the largest value of all
+    robots.  For one link it is the largest age less the mean age, at most twice the mean age: a single very old message says
+    little about the others."""
     jitter = {
         (link.source, link.receiver): min(link.age_max_ns - link.age_mean_ns, 2 * link.age_mean_ns) / 1e9
         for link in links

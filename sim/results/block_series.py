@@ -1,4 +1,4 @@
-"""The transformed state over time: of every block its value, what is desired, the error and the rates."""
+"""The transformed state over time: for every block its value, its desired value, its error, and their rates of change."""
 
 from dataclasses import dataclass
 
@@ -18,17 +18,22 @@ VELOCITY = field_index(STATE_FIELDS, "vx", "vy")
 
 @dataclass(frozen=True, slots=True)
 class BlockSeries:
-    """A block Z_b of the transformed state (docs/architecture.md, 2.3) at T instants; arrays are (T, block.size).
-
-    error e = Z_b - Z_bd [m], rate dZ_b/dt [m/s], error_rate de/dt [m/s]; norm |e| is (T,) [m]."""
+    """A block Z_b of the transformed state (docs/architecture.md, 2.3) at T instants; arrays are (T, block.size) but for
+    `norm`."""
 
     block: BlockPlan
     value: Array
+    """Z_b [m]"""
     desired: Array
+    """Z_bd [m]"""
     error: Array
+    """e = Z_b - Z_bd [m]"""
     rate: Array
+    """dZ_b/dt [m/s]"""
     error_rate: Array
+    """de/dt [m/s]"""
     norm: Array
+    """|e| [m], (T,)"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +52,7 @@ class Blocks:
 def block_series(trace: Trace) -> Blocks:
     """Returns all blocks at the instants at which every robot has a state.
 
-    A state that is not finite gives values that are not finite; nothing is raised or warned of."""
+    A state that is not finite gives values that are not finite, without an exception or a warning."""
     times_ns, states = trace.common()
     plan = trace.plan
     transformation = Transformation(plan)
@@ -73,7 +78,10 @@ def block_series(trace: Trace) -> Blocks:
 
 
 def _transformed(transformation: Transformation, x: Array) -> Array:
-    """Returns Z = Φ_M x; a robot that is not finite spoils only the variables that it is part of (0 · NaN is not 0)."""
+    """Returns Z = Φ_M x, (T, N, 2), for positions or velocities x of N robots, (T, N, 2).
+
+    A robot whose x is not finite makes only those variables NaN that it is part of: a plain product would spoil all of them,
+    since 0 · NaN is not 0."""
     finite = np.isfinite(x)
     if finite.all():
         return transformation.forward(x)
@@ -83,7 +91,7 @@ def _transformed(transformation: Transformation, x: Array) -> Array:
 
 
 def component_names(block: BlockPlan) -> tuple[str, ...]:
-    """Returns what the numbers of a block are called: `x`, `y` of the centroid, `z1_x`, `z1_y`, `z2_x` … of a shape."""
+    """Returns the names of a block's components in order: `x`, `y` for the centroid, `z1_x`, `z1_y`, `z2_x`, … for a shape."""
     if block.node is None:
         return ("x", "y")
     return tuple(f"z{number}_{axis}" for number in range(1, block.size // 2 + 1) for axis in "xy")

@@ -1,4 +1,4 @@
-"""What a summary says of the buses, in lines for people: frames, what was stopped and why, faults, the referee's findings."""
+"""The lines about the CAN buses in a summary for a terminal: frames, stopped torques, faults, the referee's findings."""
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
@@ -7,11 +7,11 @@ from typing import Final
 from echelon.bridge.reports import CanReport, RefereeReport
 
 SHOWN: Final = 5
-"""How many of many are listed."""
+"""Items that a list shows in full; the rest are counted."""
 
 
 def can_lines(can: CanReport | None) -> Iterator[str]:
-    """Yields the lines of a terminal."""
+    """Yields the lines; none without a bus or without frames."""
     if can is None or not can.frames:
         return
     facts = [f"{can.frames} frames"]
@@ -40,10 +40,12 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
     if can.referee is not None:
         found = ", ".join(f"{number} {kind}" for kind, number in can.referee.kinds.items()) or "nothing wrong"
         yield f"  referee  {can.referee.frames} frames{can.referee.up_to}: {found}"
+        if can.referee.after_stop:
+            yield f"  stop     {can.referee.after_stop}"
 
 
 def finding_text(referee: RefereeReport) -> str:
-    """Returns how many findings there are, and the first one."""
+    """Returns in a sentence how many findings there are, and the first one.  There must be one at least."""
     first = referee.findings[0]
     what = " ".join(filter(None, (first.bus, first.id, first.robot, first.kind)))
     total = sum(referee.kinds.values())
@@ -51,6 +53,6 @@ def finding_text(referee: RefereeReport) -> str:
 
 
 def some(texts: Sequence[str]) -> str:
-    """Returns texts as a list in words, the first few of many."""
+    """Returns texts joined by commas: the first `SHOWN` of them, then how many more there are."""
     more = f", and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
     return ", ".join(texts[:SHOWN]) + more

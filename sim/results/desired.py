@@ -1,7 +1,7 @@
-"""The desired trajectory for those who look on: the recorder, measures, figures.
+"""The desired trajectory for code that observes a run: the recorder, the results and the figures.
 
-A trajectory that others wrote may fail at an instant, or never answer.  That ends a run, and is said there; who looks at what
-the run left is to see the rest of it.
+A trajectory from a user's file or from a plug-in may raise an error at some instant, or never return.  In the run itself that
+ends the run with an error message.  Here it gives NaN instead, so that everything else about the run can still be shown.
 """
 
 import numpy as np
@@ -12,11 +12,11 @@ from echelon.plan.plan import Array, Plan
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
 
 PATIENCE_S = 2.0
-"""For one instant; a trajectory that takes longer is not asked any more"""
+"""Time limit for one instant; a trajectory that exceeds it once is not called again"""
 
 
 class Desired:
-    """z_cd, ż_cd and z̈_cd of a plan at any instant; not a number where the trajectory does not say."""
+    """The desired position z_cd of the centroid and its derivatives at any instant; NaN where the trajectory fails."""
 
     def __init__(self, plan: Plan) -> None:
         self._trajectory = make_trajectory(plan.trajectory)
@@ -38,5 +38,5 @@ class Desired:
         return np.full((3, 2), np.nan)
 
     def sample(self, times: Array) -> Array:
-        """Returns it at many instants [s], (T, 3, 2)."""
+        """Returns z_cd, ż_cd and z̈_cd at the instants `times` [s], (T,), as an array (T, 3, 2)."""
         return np.array([self.at(t) for t in times.tolist()]).reshape(-1, 3, 2)

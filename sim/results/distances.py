@@ -1,8 +1,8 @@
-"""Distances between robots, between the recorded instants too.
+"""Distances between robots, at the recorded instants and between them.
 
-From one instant to the next every robot is taken to move in a straight line at constant speed; of that motion the
-closest approach is exact: with the pair's offset r0 at the first instant and its change D up to the next,
-|r0 + s D| is least for s = -r0·D / |D|², clipped to [0, 1].  A real path bends between instants by at most |p̈| T²/8.
+Between two instants every robot is taken to move in a straight line at constant speed.  For this motion the closest approach of
+a pair is exact: with the pair's offset r0 at the first instant and the change D of the offset up to the next one, |r0 + s D| is
+least at s = -r0·D / |D|², clipped to [0, 1].  A real path differs from the straight line by at most |p̈| T²/8.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Encounter:
-    """How close two robots (by index) came, and when."""
+    """The closest approach of two robots (by index): their distance [m] and the instant."""
 
     pair: tuple[int, int]
     distance: float
@@ -38,24 +38,27 @@ class Violation:
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """`smallest` (T,) [m] is the smallest distance of all pairs from each instant up to the next, NaN where there is
-    none; `closest` is the closest encounter; `violations` are ordered by their beginning."""
+    """The distances of all pairs of robots at T instants, and between them."""
 
     times_ns: NDArray[np.int64]
+    """(T,)"""
     smallest: Array
+    """The smallest distance of all pairs from each instant up to the next [m], (T,); NaN where no pair has a finite distance"""
     closest: Encounter | None
+    """The closest encounter of the run; None where no pair has a finite distance"""
     violations: tuple[Violation, ...]
+    """In order of their beginning"""
 
 
 def distances(trace: Trace) -> Distances:
     """Returns the distances between robots at the instants at which every robot has a state, and between them.
 
-    Where a position is not finite it has no distance to others.  A violation is a distance of at most the plan's
+    A robot whose position is not finite has no distance to other robots.  A violation is a distance of at most the plan's
     avoidance radius r_a, also where avoidance is not enabled."""
     times_ns, states = trace.common()
     x, y = (np.ascontiguousarray(states[:, :, field]) for field in POSITION)
     instants = len(times_ns)
-    if instants == 1:  # a single instant is a motion without motion
+    if instants == 1:  # a single instant counts as a motion of length zero
         times_ns, x, y = np.repeat(times_ns, 2), np.repeat(x, 2, axis=0), np.repeat(y, 2, axis=0)
     smallest = np.full(len(times_ns), np.nan)
     closest: Encounter | None = None
@@ -77,14 +80,17 @@ def distances(trace: Trace) -> Distances:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """One robot with all later ones: offsets x, y and distances `at` instants are (T, pairs); `along` (s above) and
-    `least` distance between instants are (T - 1, pairs)."""
+    """The pairs of one robot with all robots of a higher index; between two instants there is a segment."""
 
     x: Array
+    """Offset in x at the instants [m], (T, pairs)"""
     y: Array
     at: Array
+    """Distance at the instants [m], (T, pairs)"""
     along: Array
+    """Where in each segment the pair is closest (s in the module's docstring, 0 to 1), (T - 1, pairs)"""
     least: Array
+    """Smallest distance in each segment [m], (T - 1, pairs)"""
 
     @classmethod
     def of(cls, x: Array, y: Array) -> "_Pairs":
@@ -97,6 +103,7 @@ class _Pairs:
         return cls(x, y, at, along, np.fmin(between, np.fmin(at[:-1], at[1:])))
 
     def closest(self, one: int, times_ns: NDArray[np.int64]) -> Encounter | None:
+        """Returns the closest encounter of robot `one` with a robot of a higher index; None without a finite distance."""
         if np.isnan(self.least).all():
             return None
         segment, column = np.unravel_index(np.nanargmin(self.least), self.least.shape)
@@ -108,9 +115,10 @@ class _Pairs:
         return Encounter((one, one + 1 + int(column)), float(self.least[segment, column]), time_ns)
 
     def violations(self, one: int, column: int, times_ns: NDArray[np.int64], radius: float) -> list[Violation]:
+        """Returns the violations of one pair, in order of time."""
         least, inside = self.least[:, column], self.at[:, column] <= radius
         touched = np.flatnonzero(least <= radius)
-        # A new interval begins where the segment before is not touched, or the instant between them lies outside.
+        # A new interval begins where the segment before is not touched, or the pair is outside at the instant between them.
         fresh = np.ones(len(touched), dtype=bool)
         fresh[1:] = (np.diff(touched) > 1) | ~inside[touched[1:]]
         starts = np.flatnonzero(fresh)
@@ -131,7 +139,8 @@ class _Pairs:
         return found
 
     def _crossings(self, segment: int, column: int, radius: float) -> tuple[float, float]:
-        """Returns where (s) a segment enters and leaves the circle: the roots of |r0 + s D|² = r_a²."""
+        """Returns at which s the pair enters and leaves the radius in a segment: the roots of |r0 + s D|² = r_a², within 0 to
+        1."""
         x, y = float(self.x[segment, column]), float(self.y[segment, column])
         dx, dy = float(self.x[segment + 1, column]) - x, float(self.y[segment + 1, column]) - y
         a, b, c = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - radius * radius

@@ -1,15 +1,27 @@
-"""How the error of a block ended: at rest, falling, growing, oscillating, or with a steady lag.
+"""How the error of a block ended, judged by the last third of the run.
 
-The last third of the run is looked at, in two halves: the sixth before the last, and the last.  The error *falls* if its
-amplitude (`rates`) is smaller in the last sixth than in the one before, and does not rise again in between.  It *grows* if the
-root mean square of its amplitude is more than `health.growth` times as large in the last sixth as in the one before, and
-larger than what is not judged: `health.floor`; what a moving formation cannot know, its speed times the ages of what it acts
-on (`ages`); and σ times what the velocity of the trajectory jumps by.  An error within 5 % of what the block started with may
-move from one steady value to another, or begin to tremble, with friction or steps of torque: it grows only if it grew in the
-sixth before, too, and would leave those 5 % if it went on like that for as long as the run has lasted.
+The last third has two parts: the sixth before the last, and the last sixth.  `amplitude` is that of `results.rates`, and its
+size in a sixth is its root mean square there.  The first ending in this table that fits is the result:
 
-It is a *steady lag* if it is a constant time times the velocity of the trajectory, a *steady error* if it is constant; to nine
-tenths of its mean square, and within the same bound from one sixth to the next.
+ending         when
+not finite     some |e| is not finite
+too short      a third of the run is shorter than the block's dwell time
+at rest        e is zero but for rounding, at the end and in the last sixth
+steady lag     e is a constant time times the velocity of the trajectory, and velocity × delay is more than a tenth of |e|
+grows          the amplitude in the last sixth is more than `health.growth` times that in the sixth before, and e is not spared
+falls          the amplitude in the last sixth is less than 0.9 times that in the sixth before, and does not rise in between
+steady error   e is constant
+oscillates     e changes its sign at least twice in the last half of the run, or |e| goes up and down in the last third
+steady error   otherwise: |e| neither grows nor falls, nor goes up and down
+
+*Constant* means: the constant explains 90 % of the mean square of e, and its size changes from one sixth to the next by a
+factor between 0.9 and `health.growth`.
+
+*Spared* is a growing error that is too small to be judged.  The amplitude in the last sixth is at most the floor: the largest
+of `health.floor`, of the steady error and its variation that the ages of messages explain (`results.ages`), and of σ times a
+jump in the velocity of the trajectory.  Or it is at most 5 % of the error that the block started with, and either did not grow
+in the sixth before, or would still be within these 5 % after another run of this length.  For with friction or with steps of
+torque a small error may move from one steady value to another, or begin to tremble.
 """
 
 from collections.abc import Sequence
@@ -28,19 +40,19 @@ from echelon.sim.results.settling import ROUNDING, dwell_ns, start_error
 from echelon.sim.results.trace import Array
 
 OVER: Final = 1.2
-"""So many times its steady lag an error may reach on the way there"""
+"""Factor by which an error may exceed its steady lag on the way there"""
 EXPLAINED: Final = 0.9
-"""Share of an error's mean square that a constant explains, if it is one"""
+"""Share of an error's mean square that a constant must explain for the error to count as constant"""
 SMALL: Final = 0.05
-"""Errors up to this share of what a block started with must grow for longer to count as growing"""
+"""Share of the error at the start; smaller errors must grow for longer to count as growing"""
 SIXTHS: Final = 6
-"""Of a run"""
+"""Parts of a run"""
 FALLS: Final = 0.9
-"""An error whose amplitude is less than so many times what it was a sixth of the run before falls, if it never rises"""
+"""An error falls if its amplitude in the last sixth is less than this multiple of that in the sixth before"""
 RISES: Final = 1.25
-"""An error rises where it is so many times its lowest before, in the last third of the run"""
+"""Values rise again if they exceed this multiple of the lowest value before"""
 WINDOWS: Final = 6
-"""Of the last third: what is within a window is a ripple"""
+"""Number of windows in which the last third is searched for rises; ups and downs within a window are ripple and do not count"""
 Kind = Literal["at rest", "falls", "grows", "oscillates", "steady lag", "steady error", "not finite", "too short"]
 
 
@@ -52,32 +64,36 @@ class Ending:
     text: str
     """The same in words, with numbers"""
     growth: float | None
-    """Amplitude in the last sixth of the run over that in the sixth before; None if the run is too short, or not finite"""
+    """Amplitude in the last sixth of the run over that in the sixth before; None if the run is too short, or an error is not
+    finite"""
     level: float
     """Root mean square of the amplitude in the last sixth [m]"""
     floor: float
-    """What is not judged [m]"""
+    """Amplitudes up to this are not judged [m]"""
     fit: Fit | None
     spared: str = ""
-    """Why it does not count as growing though it grew by more than `health.growth`; empty where it did not, or counts"""
+    """Why the error does not count as growing though it grew by more than `health.growth`; empty if it did not, or counts"""
 
     @property
     def judged(self) -> bool:
-        """False if there is too little to tell how it ended."""
+        """False if nothing can be said: an error is not finite, or the run is too short."""
         return self.kind not in ("not finite", "too short")
 
 
 @dataclass(frozen=True, slots=True)
 class _Reference:
-    """The trajectory's velocity (T, 2) [m/s], and where its speed is largest, and what it jumps by, in the last third."""
+    """The velocity of the desired trajectory."""
 
     velocity: Array
+    """(T, 2) [m/s]"""
     speed: float
+    """Largest speed in the last third of the run [m/s]"""
     jump: float
+    """Largest jump of the velocity in the last third of the run [m/s]"""
 
 
 def endings(plan: Plan, blocks: Blocks, links: Sequence[LinkCounts]) -> tuple[Ending, ...]:
-    """Returns how each block ended, in the order of the plan."""
+    """Returns how the error of each block ended, in the order of the plan."""
     times_ns = blocks.times_ns
     if not len(times_ns):
         return tuple(Ending("too short", "was never recorded", None, 0.0, 0.0, None) for _ in blocks.series)
@@ -98,7 +114,7 @@ def _reference(blocks: Blocks) -> _Reference:
     velocity = centroid.rate - centroid.error_rate
     late = blocks.times_ns >= _part_ns(blocks.times_ns, 4)
     steps = np.diff(velocity[late], axis=0)
-    # A jump is what the velocity changes by in one step beyond what it does in the steps beside it.
+    # A jump is the change of velocity in one step, less the larger one of the changes in the steps beside it.
     jump = 0.0
     if len(steps) > 2:
         sizes = np.linalg.norm(steps, axis=1)
@@ -110,12 +126,12 @@ def _reference(blocks: Blocks) -> _Reference:
 
 
 def _part_ns(times_ns: NDArray[np.int64], sixths: int) -> int:
-    """Returns when so many sixths of the run are over."""
+    """Returns the instant [ns] at which `sixths` sixths of the run are over."""
     return int(times_ns[0]) + (int(times_ns[-1]) - int(times_ns[0])) * sixths // SIXTHS
 
 
 def _sixth(times_ns: NDArray[np.int64], number: int) -> NDArray[np.bool_]:
-    """Returns which instants are in a sixth of the run, counted from 0."""
+    """Returns a mask (T,) of the instants in the sixth `number` of the run; numbers begin at 0."""
     return (times_ns >= _part_ns(times_ns, number)) & (times_ns < _part_ns(times_ns, number + 1))
 
 
@@ -136,7 +152,7 @@ def _ending(
     with np.errstate(all="ignore"):
         fit = decay(times_ns, sizes, _rms(sizes[last]))
     if int(times_ns[-1]) - int(times_ns[0]) < 3 * wait_ns or not before.any():
-        text = f"cannot be judged, for a third of the run is shorter than {wait_ns / 1e9:.4g} s, its dwell time"
+        text = f"cannot be judged: a third of the run is shorter than its dwell time, {wait_ns / 1e9:.4g} s"
         return Ending("too short", text, None, _rms(sizes[last]), floor, fit)
     earlier, level = _rms(sizes[before]), _rms(sizes[last])
     growth = level / earlier if earlier > 0 else 1.0 if level <= ROUNDING else float("inf")
@@ -179,8 +195,10 @@ def _ending(
 
 
 def _spared(level: float, earlier: float, sooner: float, floor: float, begun: float, bound: float) -> str:
-    """Returns why an error that grew does not count as growing; empty if it counts.  `level`, `earlier` and `sooner` are its
-    amplitude in the last three sixths of the run, the last one first."""
+    """Returns why an error that grew by more than `bound` does not count as growing; empty if it counts.
+
+    `level`, `earlier` and `sooner` are its amplitudes [m] in the last sixth of the run, in the one before, and in the one
+    before that; `begun` is the error that the block started with [m]."""
     if level <= floor:
         return f"it is within {floor:.3g} m, which is not judged"
     share = SMALL * begun
@@ -197,8 +215,8 @@ def _spared(level: float, earlier: float, sooner: float, floor: float, begun: fl
 def _constant(
     error: Array, velocity: Array | None, before: NDArray[np.bool_], last: NDArray[np.bool_], bound: float
 ) -> bool:
-    """True if an error is constant in the last third, or a constant time (its own of each variable) times the velocity, and
-    does not grow by more than the bound from one sixth to the next.  error (T, size), velocity (T, 2)."""
+    """True if an error (T, size) is constant in the last third; with a velocity (T, 2), if each of its variables is a constant
+    time times the velocity.  From one sixth to the next the constant changes by a factor from `FALLS` to `bound`."""
     both = before | last
     if velocity is None:
         whole, first, second = (error[part].mean(axis=0) for part in (both, before, last))
@@ -220,7 +238,7 @@ def _constant(
 
 
 def _oscillates(series: BlockSeries, part: NDArray[np.bool_]) -> bool:
-    """True if the error changes its sign twice or more along the direction in which it is largest."""
+    """True if the error's component along its largest value changes its sign at least twice."""
     error = series.error[part]
     if not error.size:
         return False
@@ -230,8 +248,8 @@ def _oscillates(series: BlockSeries, part: NDArray[np.bool_]) -> bool:
 
 
 def _rises(values: Array) -> bool:
-    """True if values rise again from their lowest: the largest in one of `WINDOWS` is more than `RISES` times what it was in
-    one before."""
+    """True if values rise again: their largest in one of `WINDOWS` windows is more than `RISES` times that in an earlier
+    one."""
     peaks = np.array([float(part.max()) for part in np.array_split(values, WINDOWS) if len(part)])
     return bool(len(peaks)) and bool((peaks > RISES * np.minimum.accumulate(peaks)).any())
 

@@ -1,4 +1,4 @@
-"""The frames of a run's can.log, decoded by the DBC of its plan."""
+"""The frames in a run's can.log, decoded by the DBC files of its plan."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ COLUMNS: Final = ("t", "bus", "identifier", "name", "data", "signals")
 
 
 class FrameDecoder:
-    """Says what frames mean, by the messages and signals of a plan's DBC."""
+    """Decodes frames by the messages and signals in the DBC files of a plan, one for each bus."""
 
     def __init__(self, plan: Plan) -> None:
         self._messages: list[dict[int, Any]] = []
@@ -28,35 +28,38 @@ class FrameDecoder:
             self._messages.append({message.frame_id: message for message in database.messages})
 
     def name(self, bus: int, can_id: int) -> str:
-        """Returns what the frames with an identifier are called; empty if they are nobody's here."""
+        """Returns the name of the message with an identifier; empty if the DBC has none."""
         message = self._messages[bus].get(can_id)
         return "" if message is None else str(message.name)
 
     def signals(self, bus: int, frame: Frame) -> dict[str, Any]:
-        """Returns the values of a frame's signals, names where the DBC has some; empty if it says nothing that is known."""
+        """Returns the values of a frame's signals by name, a value's own name if the DBC has one.
+
+        Returns an empty mapping for an unknown identifier, a remote frame, and data that cannot be decoded."""
         message = self._messages[bus].get(frame.can_id)
         if message is None or frame.remote:
             return {}
         try:
             values: Mapping[str, Any] = message.decode(frame.data, allow_truncated=True)
-        except Exception:  # whatever cantools makes of bytes that are not what their identifier says
+        except Exception:  # cantools raises errors of several kinds for data that do not fit the message
             return {}
         return {name: value if isinstance(value, (int, float)) else str(value) for name, value in values.items()}
 
     def units(self, bus: int, can_id: int) -> dict[str, str]:
-        """Returns the units of the signals of a message."""
+        """Returns the units of a message's signals by name; empty for a signal without a unit.  Raises KeyError for an unknown
+        identifier."""
         return {signal.name: signal.unit or "" for signal in self._messages[bus][can_id].signals}
 
 
 def frame_data(frame: Frame) -> str:
-    """Returns a frame's bytes as candump writes them: hexadecimal, or R for a remote frame."""
+    """Returns a frame's data as candump writes them: hexadecimal, or R for a remote frame."""
     return "R" if frame.remote else frame.data.hex().upper()
 
 
 def frames_table(plan: Plan, frames: Iterable[BusFrame]) -> Table:
-    """Returns frames in their order, those of bringing up drives at times below zero.
+    """Returns a row for each frame, in the given order.  Frames from the bring-up of drives have negative times `t`.
 
-    `identifier` is hexadecimal, `0x101`; `signals` are JSON, null where a value is not finite."""
+    `identifier` is hexadecimal, for example `0x101`.  `signals` is JSON text; a value that is not finite becomes null."""
     decoder, names = FrameDecoder(plan), [bus.name for bus in plan.can.buses]
     rows = [
         (

@@ -1,4 +1,4 @@
-"""What is measured of a run: settling, error integrals, separation, claims, distances, torque, links."""
+"""The measures of a run as records: blocks, separation of time scales, claims, distances, torques, links."""
 
 from collections.abc import Iterable, Sequence
 from math import isfinite
@@ -19,20 +19,23 @@ from echelon.sim.results.records import (
     ClaimResult,
     DistanceResult,
     LinkResult,
-    Outcome,
     SeparationResult,
     TorqueResult,
     ViolationResult,
 )
 from echelon.sim.results.settling import Settling, settle, start_error
 from echelon.sim.results.trace import Array, Trace
+from echelon.sim.results.verdict import Outcome
 
 STARTED_NS: Final = 1_000_000_000
-"""Saturation in the first second is counted apart: the step at the start is its usual cause."""
+"""End of the first second [ns].  Saturation after it is also counted by itself: within it the errors at the start are the usual
+cause."""
 
 
 def block_result(plan: Plan, series: BlockSeries, times_ns: NDArray[np.int64], ending: Ending) -> BlockResult:
-    """Returns a block's settling times, decay, ending, peak, residual and error integrals."""
+    """Returns settling times, decay rate, ending, peak, residual and error integrals of a block.
+
+    The integrals are ∫|e|² dt, ∫|e| dt and ∫ t |e| dt by the trapezoidal rule; `times_ns` is (T,)."""
     norm, seconds = series.norm, times_ns / 1e9
     largest = int(np.argmax(norm)) if len(norm) else None
     to_2, to_5 = (settle(plan, series, times_ns, fraction) for fraction in (0.02, 0.05))
@@ -61,7 +64,7 @@ def block_result(plan: Plan, series: BlockSeries, times_ns: NDArray[np.int64], e
 
 
 def separation_results(rows: Sequence[BlockResult], blocks: Blocks) -> tuple[SeparationResult, ...]:
-    """Returns each time scale σ compared with the next faster: a layer, or blocks where each has its own scale."""
+    """Returns each time scale σ compared with the next faster one.  `rows` are the results of `blocks`, in the same order."""
     shown = [row for row, series in zip(rows, blocks.series, strict=True) if series.block.size]
     scales: dict[float, list[BlockResult]] = {}
     for row in shown:
@@ -83,9 +86,9 @@ def separation_results(rows: Sequence[BlockResult], blocks: Blocks) -> tuple[Sep
 
 
 def _rate_ratio(slow: Sequence[BlockResult], fast: Sequence[BlockResult]) -> float | None:
-    """Returns how many times as fast the slowest of the fast blocks decays as the slowest of the slow ones; None where one does
-    not decay, or its rate cannot be told."""
-    if not _told_apart([*slow, *fast]):
+    """Returns the decay rate of the slowest of the fast blocks over that of the slowest of the slow blocks; None if a block
+    does not decay, or has no decay rate."""
+    if not _long_enough([*slow, *fast]):
         return None
     times = [
         [1 / row.decay_rate if row.decay_rate and row.decay_rate > 0 else None for row in rows] for rows in (slow, fast)
@@ -94,32 +97,36 @@ def _rate_ratio(slow: Sequence[BlockResult], fast: Sequence[BlockResult]) -> flo
 
 
 def _rate_fit(rows: Sequence[BlockResult]) -> float | None:
-    """Returns the smallest r² of the blocks' fits."""
+    """Returns the smallest r² of the blocks' fits; None if there is none, or the run is too short for one of the blocks."""
     fits = [row.decay_fit for row in rows if row.decay_fit is not None]
-    return min(fits, default=None) if _told_apart(rows) else None
+    return min(fits, default=None) if _long_enough(rows) else None
 
 
-def _told_apart(rows: Sequence[BlockResult]) -> bool:
-    """True if a run is long enough for the decay rates of blocks: the start of an oscillation is no decay."""
+def _long_enough(rows: Sequence[BlockResult]) -> bool:
+    """True if the run is long enough for the decay rates of these blocks: in a short run the start of an oscillation would be
+    taken for a decay."""
     return all(row.ending not in ("too short", "not finite") for row in rows)
 
 
 def _ratio(slow: Sequence[float | None], fast: Sequence[float | None]) -> float | None:
+    """Returns the longest of the slow times over the longest of the fast ones; None if a time is None, or the fast ones are
+    0."""
     late, soon = _slowest(slow), _slowest(fast)
     return None if late is None or not soon else late / soon
 
 
 def _scale_name(scale: Sequence[BlockResult], layers: Sequence[str]) -> str:
+    """Returns the layer's name if the blocks of a time scale are exactly one layer, otherwise the names of the blocks."""
     layer = scale[0].layer
     whole = all(row.layer == layer for row in scale) and len(scale) == layers.count(layer)
     return layer if whole else ", ".join(row.name for row in scale)
 
 
 def claim_results(plan: Plan, blocks: Blocks, endings: Sequence[Ending]) -> tuple[tuple[ClaimResult, str], ...]:
-    """Returns each claim, held against the slowest of its blocks, with a sentence about it."""
+    """Returns the result of each claim, which the slowest of its blocks decides, with a sentence about it."""
     end_ns = int(blocks.times_ns[-1]) if len(blocks.times_ns) else None
     if end_ns is not None and end_ns >= plan.duration_ns - plan.root.period_ns:
-        end_ns = plan.duration_ns  # the last instant that all robots share may be one period before
+        end_ns = plan.duration_ns  # the last instant that all robots share may be one period of the root before the end
     results = []
     for claim in plan.claims:
         by_ns = round(claim.settled_by * 1e9)
@@ -130,14 +137,14 @@ def claim_results(plan: Plan, blocks: Blocks, endings: Sequence[Ending]) -> tupl
         ]
         times = {name: _seconds(settling.settled_ns) for name, settling, _ in found}
         measured = _slowest(times.values())
-        told = [_told(name, settling, ending, by_ns) for name, settling, ending in found]
+        outcomes = [_claim_outcome(name, settling, ending, by_ns) for name, settling, ending in found]
         outcome: Outcome
         lost = any(ending.kind == "not finite" for _, _, ending in found)
         if end_ns is None or (by_ns > end_ns and not lost):
             ended = "nothing was simulated" if end_ns is None else f"the run ended at {end_ns / 1e9:g} s"
             outcome, why = "not tested", ended
         else:
-            outcome, why = min(told, key=lambda one: ("failed", "not tested", "passed").index(one[0]))
+            outcome, why = min(outcomes, key=lambda one: ("failed", "not tested", "passed").index(one[0]))
         if outcome == "passed" and measured is not None:
             slowest = max(found, key=lambda one: times[one[0]] or 0.0)
             why = f"{slowest[0]} as the last at {measured:.6g} s, to {slowest[1].band:.3g} m" if len(found) > 1 else why
@@ -158,8 +165,8 @@ def claim_results(plan: Plan, blocks: Blocks, endings: Sequence[Ending]) -> tupl
     return tuple(results)
 
 
-def _told(name: str, settling: Settling, ending: Ending, by_ns: int) -> tuple[Outcome, str]:
-    """Returns whether a block settled in time, and what it did, in words."""
+def _claim_outcome(name: str, settling: Settling, ending: Ending, by_ns: int) -> tuple[Outcome, str]:
+    """Returns whether a block settled by `by_ns`, and a phrase that says when, or why not."""
     entered_ns, band = settling.entered_ns, f"{settling.band:.3g} m"
     if entered_ns is None:
         return "failed", f"{name} did not settle to {band}: it {ending.text}"
@@ -174,7 +181,7 @@ def _told(name: str, settling: Settling, ending: Ending, by_ns: int) -> tuple[Ou
 
 
 def distance_result(plan: Plan, near: Distances) -> DistanceResult:
-    """Returns the closest encounter and every violation, with robots' names."""
+    """Returns the closest encounter and every violation, with the robots' names."""
     names, closest = [robot.name for robot in plan.robots], near.closest
     return DistanceResult(
         smallest=None if closest is None else closest.distance,
@@ -197,9 +204,9 @@ def distance_result(plan: Plan, near: Distances) -> DistanceResult:
 
 
 def torque_result(trace: Trace, robot: int) -> TorqueResult:
-    """Returns a robot's wheel torques over its whole run."""
+    """Returns root mean square, peak and saturation of the wheel torques of a robot (by index) over the run."""
     plan = trace.plan.robots[robot]
-    # The state at the start has no period behind it.
+    # The state at time 0 is not the result of a period, so it has no torque.
     began = trace.times_ns[robot] > 0
     times_ns = trace.times_ns[robot][began]
     fields = dict(zip(STATE_FIELDS, trace.states[robot][began].T, strict=True))
@@ -239,7 +246,7 @@ def _finite(value: SupportsFloat) -> float | None:
 
 
 def link_result(plan: Plan, counts: LinkCounts) -> LinkResult:
-    """Returns one link's counts with its members' names: a row of `links.csv`."""
+    """Returns the counts of a link with the names of its ends: a row of `links.csv`."""
     members = plan.all_roles
     return LinkResult(
         source=members[counts.source].name,
@@ -257,7 +264,7 @@ def link_result(plan: Plan, counts: LinkCounts) -> LinkResult:
 
 
 def _slowest(times: Iterable[float | None]) -> float | None:
-    """Returns the longest of some times, None if there is none, or one of them is none."""
+    """Returns the longest of some times; None without times, or if one of them is None."""
     known = list(times)
     return None if None in known or not known else max(time for time in known if time is not None)
 

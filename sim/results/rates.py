@@ -1,13 +1,13 @@
 """How fast an error decays or grows: a line fitted to the logarithm of its amplitude.
 
-|e| of an oscillating block falls to zero twice in a period.  Its *amplitude* does not.  For the block alone,
+|e| of an oscillating block passes near zero twice in a period; its *amplitude* does not.  For the block alone,
 
     ë = -K_1 e - K_2 ė,   K_1 = k1/σ²,  K_2 = k2/σ,   α = K_2/2,  ω² = K_1 - α² > 0,
 
     a² = |e|² + |ė + α e|²/ω²
 
-falls as e^(-2αt), without a ripple.  Where the block does not oscillate (ω² ≤ 0) the amplitude is |e|.  Matrix gains count with
-their mean on the diagonal.  With delays, lead and coupling the block's true α and ω differ, and a little of the ripple is back.
+falls as e^(-2αt), without a ripple.  If the block does not oscillate (ω² ≤ 0), the amplitude is |e|.  For matrix gains k1 and
+k2 are the means of their diagonals.  Delays, lead and coupling change α and ω a little; then a small ripple remains.
 """
 
 from dataclasses import dataclass
@@ -21,21 +21,22 @@ from echelon.sim.results.settling import ROUNDING
 from echelon.sim.results.trace import Array
 
 LEFT: Final = 0.02
-"""A decay is fitted down to this share of its largest amplitude"""
+"""A decay is fitted down to this share of the largest amplitude"""
 LEAST: Final = 8
-"""Instants that a fit needs"""
+"""Number of instants that a fit needs"""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """amplitude ~ e^(-rate t): the rate [1/s], negative where it grows, and r² of the fit to its logarithm."""
+    """The fit amplitude ~ e^(-rate t): its rate [1/s], negative if the amplitude grows, and r² of the line fitted to the
+    logarithm."""
 
     rate: float
     r_squared: float
 
 
 def amplitude(series: BlockSeries) -> Array:
-    """Returns a block's amplitude [m], (T,)."""
+    """Returns the amplitude a of a block's error [m], (T,)."""
     block = series.block
     if not block.size:
         return series.norm
@@ -50,11 +51,11 @@ def amplitude(series: BlockSeries) -> Array:
 
 
 def decay(times_ns: NDArray[np.int64], amplitudes: Array, level: float) -> Fit | None:
-    """Returns the fit from the largest amplitude down to `LEFT` of it, or to twice the `level` at which it stays in the end
-    [m].
+    """Returns the fit from the largest amplitude down to the share `LEFT` of it, or down to twice the final amplitude `level`
+    [m], at most 1/e of the largest, if that comes sooner.
 
-    Where the amplitude is largest in the last half of the run, the fit is over that half.  None if there is too little of
-    it."""
+    If the largest amplitude is in the last half of the run, the error grows, and the fit is over that half.  Returns None if an
+    amplitude is not finite, or if there are fewer than `LEAST` instants to fit, or an amplitude of zero among them."""
     if len(amplitudes) < LEAST or not np.isfinite(amplitudes).all():
         return None
     begin = int(np.argmax(amplitudes))

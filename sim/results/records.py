@@ -1,152 +1,78 @@
-"""The results of a run, as frozen records.  `summary.json` is their rendering (echelon.sim.results.rendering).
+"""The results of a run as frozen records, apart from the verdict (`results.verdict`).  `results.rendering` writes them as
+`summary.json`.
 
-Times are in seconds of run time, lengths in metres, torques in newton metres.  A number that is not finite is None, and so is
-the settling time of a block that did not settle.
+Instants are run time [s], lengths are in metres, torques in newton metres.  A number that is not finite is None, and so is the
+settling time of a block that did not settle.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 from echelon.bridge.reports import CanReport
+from echelon.sim.results.verdict import Outcome, Verdict
 
 FORMAT: Final = 3
-"""Of summary.json; one more whenever a key changes its meaning or goes"""
-Outcome = Literal["passed", "failed", "not tested"]
-CLAIM: Final = "claim"
-"""Name of the checks that are claims of the scenario"""
-CAUSES: Final = ("whole", "finite")
-"""Names of the checks whose failure is why others fail, or cannot be tested"""
-
-
-@dataclass(frozen=True, slots=True)
-class CheckResult:
-    """One thing that was looked at, with its outcome."""
-
-    name: str
-    """`claim`, or one of the health checks of docs/scenario.md"""
-    outcome: Outcome
-    text: str
-    """One sentence"""
-    measured: float | None = None
-    """What was measured; None where it is no number, or there is none"""
-    unit: str = ""
-    """Of what was measured and of its bound"""
-    bound: float | None = None
-    about: tuple[str, ...] = ()
-    """Blocks, robots or links that it is about; empty: the whole run"""
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What a run showed.  HOLDS: it claimed something, all claims passed, and no check failed.  HEALTHY: it claimed nothing,
-    and no check failed.  FAILS: everything else."""
-
-    word: Literal["HOLDS", "HEALTHY", "FAILS"]
-    checks: tuple[CheckResult, ...]
-
-    @property
-    def fails(self) -> bool:
-        """True if the word is FAILS."""
-        return self.word == "FAILS"
-
-    @property
-    def claims(self) -> tuple[CheckResult, ...]:
-        """The checks that are claims of the scenario."""
-        return tuple(check for check in self.checks if check.name == CLAIM)
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why the run fails: the sentences of what failed, and then of claims that were not tested.  First comes what is the
-        cause of others: the run broke off, or a state was not finite."""
-        failed = [check for check in self.checks if check.outcome == "failed"]
-        failed.sort(key=lambda check: check.name not in CAUSES)
-        untested = [check for check in self.checks if check.outcome == "not tested" and check.name == CLAIM]
-        return tuple(f"{check.name}: {check.text}" for check in (*failed, *untested))
-
-    @property
-    def not_tested(self) -> tuple[str, ...]:
-        """The sentences of what could not be tested, claims left out."""
-        return tuple(
-            f"{check.name}: {check.text}"
-            for check in self.checks
-            if check.outcome == "not tested" and check.name != CLAIM
-        )
-
-    @property
-    def sentence(self) -> str:
-        """The word, and what it stands on."""
-        claims, others = len(self.claims), [check.outcome for check in self.checks if check.name != CLAIM]
-        passed = f"{count(others.count('passed'), 'check')} passed"
-        passed += f", {len(self.not_tested)} not tested" if self.not_tested else ""
-        match self.word:
-            case "HOLDS":
-                return f"HOLDS: {count(claims, 'claim')} and {passed}"
-            case "HEALTHY":
-                return f"HEALTHY: nothing was claimed; {passed}"
-        failed = f"{count(len(self.reasons), 'reason')}; {passed}"
-        return f"FAILS: {failed}" if claims else f"FAILS: nothing was claimed; {failed}"
-
-    def __str__(self) -> str:
-        return "\n".join([self.sentence, *self.reasons, *(f"not tested: {text}" for text in self.not_tested)])
-
-
-def count(number: int, what: str) -> str:
-    """Returns a number of things in words: `1 claim`, `3 claims`."""
-    return f"{number} {what}{'s' * (number != 1)}"
+"""Format of summary.json; it increases by one whenever a key changes its meaning or is removed"""
 
 
 @dataclass(frozen=True, slots=True)
 class ClaimResult:
-    """A claim of the scenario, held against the slowest of its blocks."""
+    """A claim of the scenario and its outcome, which the slowest of its blocks decides."""
 
     block: str
+    """The blocks that the claim is about, as the scenario gives them: the name of a block or of a layer, or `*` for all"""
     settled_by: float
+    """When all of these blocks must have settled [s]"""
     band: float
-    """Share of the error that a block starts with"""
+    """The band to settle to, as a share of the error that a block starts with"""
     measured: float | None
-    """When the slowest of its blocks settled"""
+    """When the slowest of these blocks settled [s]; None if one did not settle"""
     blocks: Mapping[str, float | None]
-    """When each of its blocks settled"""
+    """When each of these blocks settled [s]; None if it did not settle"""
     bands: Mapping[str, float]
-    """The band of each of its blocks [m]"""
+    """The band of each of these blocks [m]"""
     outcome: Outcome
-    """`not tested`: the run ended before it could be told"""
+    """`not tested`: the run ended before the claim could be decided"""
 
 
 @dataclass(frozen=True, slots=True)
 class BlockResult:
-    """A block Z_b and its error e(t); the integrals are by the trapezoidal rule."""
+    """A block Z_b and its error e(t) over the run; integrals are computed by the trapezoidal rule."""
 
     name: str
+    """Name of the block: path of its group, `inter` or `centroid`"""
     layer: str
+    """`intra`, `middle`, `inter` or `centroid`"""
     sigma: float
     """Time scale σ [s]"""
     start_error: float | None
-    """The error that it starts with [m]: its largest |e| within the first response time, 3 σ/√k1"""
+    """The error that the block starts with [m]: its largest |e| within its response time, 3 σ/√k1"""
     dwell: float
-    """How long |e| must stay in a band until the end of the run to be settled [s]"""
+    """How long |e| must stay in a band until the end of the run to count as settled [s]"""
     settling_2: float | None
-    """From when on |e| stays within `band_2`; None if it does not, or not for the dwell time"""
+    """When |e| settled to `band_2` [s]: from then on it stays within; None if it does not, or for less than the dwell time"""
     band_2: float
-    """2 % of the error that it starts with, or `health.floor` where it starts within that [m]"""
+    """2 % of the error that the block starts with [m]; `health.floor` if it starts with an error of at most that"""
     settling_5: float | None
+    """When |e| settled to `band_5` [s]; None as for `settling_2`"""
     band_5: float
-    """The same with 5 %"""
+    """The same as `band_2` with 5 % [m]"""
     decay_rate: float | None
-    """Of the error's amplitude, by a line fitted to its logarithm [1/s]; negative where it grows"""
+    """Decay rate of the error's amplitude, by a line fitted to its logarithm [1/s]; negative if the amplitude grows"""
     decay_fit: float | None
-    """r² of that fit"""
+    """r² of this fit"""
     ending: str
-    """How |e| ended: `at rest`, `falls`, `grows`, `oscillates`, `steady lag`, `steady error`, `not finite`; or the run is `too
-    short` to tell"""
+    """How |e| ended: `at rest`, `falls`, `grows`, `oscillates`, `steady lag`, `steady error` or `not finite`; `too short` if
+    the run is too short to judge it"""
     remark: str
-    """The same in words, with numbers"""
+    """The same as `ending` in words, with numbers"""
     residual: float | None
     """|e| at the end [m]"""
     peak_error: float | None
     """Largest |e| [m]"""
     peak_time: float | None
+    """When |e| was largest [s]"""
     ise: float | None
     """∫|e|² dt [m² s]"""
     iae: float | None
@@ -157,19 +83,24 @@ class BlockResult:
 
 @dataclass(frozen=True, slots=True)
 class SeparationResult:
-    """Two neighbouring time scales compared."""
+    """A time scale σ compared with the next faster one."""
 
     faster: str
+    """The layer, or the blocks, with the smaller σ"""
     slower: str
+    """The layer, or the blocks, with the larger σ"""
     sigma_ratio: float
+    """σ of the slower over σ of the faster"""
     rate_ratio: float | None
-    """Decay rate of the faster over that of the slower, of each the slowest of its blocks; None if one does not decay, or the
-    run is too short to tell"""
+    """Decay rate of the faster over that of the slower, each that of its slowest block; None if a block does not decay, or the
+    run is too short"""
     rate_fit: float | None
-    """The smallest r² of the fits; None where there is no ratio for lack of time"""
+    """The smallest r² of the fits; None if there is none, or the run is too short"""
     settling_2_ratio: float | None
-    """Settling time of the slower over that of the faster; other than a ratio of time scales, it depends on where they start"""
+    """Settling time (2 %) of the slower over that of the faster.  Unlike `sigma_ratio` it depends on the errors at the
+    start."""
     settling_5_ratio: float | None
+    """The same with 5 %"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,26 +108,35 @@ class ViolationResult:
     """An unbroken interval in which two robots were not farther apart than the avoidance radius."""
 
     pair: tuple[str, str]
+    """The two robots"""
     first: float
+    """Its beginning [s]"""
     last: float
+    """Its end [s]"""
     smallest: float
-    """[m]"""
+    """The smallest distance in it [m]"""
 
 
 @dataclass(frozen=True, slots=True)
 class DistanceResult:
-    """Distances between robots, between the recorded instants too."""
+    """Distances between robots, at the recorded instants and between them."""
 
     smallest: float | None
-    """[m]"""
+    """The smallest distance of the run [m]; this and the next two are None if no two robots had a finite distance"""
     pair: tuple[str, str] | None
+    """The two robots with this distance"""
     time: float | None
+    """When they had it [s]"""
     between_instants: str
-    """How the motion between recorded instants is taken"""
+    """The motion that is assumed between the recorded instants"""
     avoidance_enabled: bool
+    """Whether robots avoid each other"""
     avoidance_radius: float
+    """[m]"""
     sensing_radius: float
+    """[m]"""
     violations: tuple[ViolationResult, ...]
+    """All violations of the avoidance radius, in order of their beginning"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,60 +144,76 @@ class TorqueResult:
     """A robot's wheel torques over its whole run."""
 
     robot: str
+    """Name of the robot"""
     torque_limit: float | None
-    """None: there is no limit"""
+    """[N m]; None: there is no limit"""
     rms: float | None
-    """Of both wheels, from the mean squares of the periods [N m]"""
+    """Root mean square over both wheels and the run [N m]"""
     rms_right: float | None
+    """[N m]"""
     rms_left: float | None
+    """[N m]"""
     peak: float | None
+    """Largest absolute value [N m]"""
     peak_wheel: str | None
+    """The wheel that had it, `right` or `left`; None if the run had no period"""
     peak_time: float | None
+    """End of the period in which it was reached [s]"""
     saturation_share: float | None
-    """Share of the inner torque periods in which a limit acted"""
+    """Share of the torque periods in which a limit of the robot acted"""
     saturated_after_first_second: int | None
-    """Torque periods; the step at the start is the usual cause in the first second"""
+    """Number of torque periods after the first second in which a limit acted; within it, the errors at the start are the usual
+    cause"""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkResult:
-    """What became of a link's messages; sent = delivered + lost + in_flight."""
+    """The messages of a link: sent = delivered + lost + in_flight."""
 
     source: str
+    """Name of the role that sends"""
     receiver: str
+    """Name of the role that receives"""
     channel: str
+    """Channel of the messages, for example `state`"""
     sent: int
+    """Messages that were sent"""
     delivered: int
+    """Messages that arrived"""
     lost: int
+    """Messages that were lost on the link"""
     in_flight: int
+    """Messages on their way at the end of the run"""
     used: int
-    """Uses of a message"""
+    """Uses of messages; a message may be used several times"""
     held: int
     """Uses of a message that had been used before, after the instant it was sent in"""
     age_mean: float | None
-    """Of what was in use, at each use [s]; None if nothing was ever used"""
+    """Mean age of the messages at each use [s]; None if none was ever used"""
     age_max: float | None
+    """Largest age of a message at a use [s]; None if none was ever used"""
 
 
 @dataclass(frozen=True, slots=True)
 class PartResult:
-    """A law, plant or trajectory that is not built in."""
+    """A law, plant, trajectory or drive protocol that is not built in."""
 
     use: str
-    """As scenario.toml beside summary.json names it"""
+    """Its name in the scenario.toml of the run's folder"""
     file: str | None
-    """Its Python file there; None if it is installed"""
+    """Its Python file in the run's folder; None if it is installed"""
     sha256: str | None
-    """Of the file, hexadecimal"""
+    """SHA-256 of the file, hexadecimal; None if it is installed"""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessResult:
-    """What a process of the run took."""
+    """What a process of the run used."""
 
     cpu_time: float
-    """[s]"""
+    """Processor time [s]"""
     resident_bytes: int
+    """Largest resident memory [bytes]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,36 +225,44 @@ class RunFacts:
     clock: str
     """`virtual` or `wall`"""
     wall_time: float | None
-    """From run time 0 to the end [s]; None, here and below, where nobody knows: the run was killed and recovered"""
+    """Wall time from run time 0 to the end [s].  This and other numbers are None if they are not known: the run was killed and
+    recovered."""
     startup_time: float | None
+    """Wall time before run time 0 [s]"""
     real_time_factor: float | None
     """Run time over wall time"""
     ticks_per_second: float | None
+    """Acceleration periods of the first robot per second of wall time"""
     messages: int | None
+    """Messages that the recorder accepted"""
     failure: str | None
-    """Why it broke off"""
+    """Why the run broke off; None if it did not"""
     stopped: str | None = None
-    """Why it was stopped before its end though nothing failed: a state that is not finite"""
+    """Why the run was stopped before its end though nothing failed: a state that is not finite"""
     date: str = ""
-    """When it began, UTC, ISO 8601"""
+    """When the run began, UTC, ISO 8601"""
     version: str = ""
-    """Of echelon"""
+    """Version of echelon"""
     machine: str = ""
-    """Operating system, processor, and how many of its cores there are"""
+    """Operating system, processor, and number of its cores"""
     python: str = ""
+    """Version of Python"""
     command: str = ""
-    """That started it"""
+    """The command that started the run"""
     late_stages: int = 0
-    """Stages that ran at their deadline without something they wanted (wall clock)"""
+    """Stages that ran at their deadline without all of their inputs (wall clock)"""
     stages: int = 0
+    """All stages that ran (wall clock)"""
     latest: float = 0.0
     """Largest lateness of a stage [s] (wall clock)"""
     refused: int = 0
-    """Payloads that were no messages for their receiver, or for the recording"""
+    """Payloads that were not valid messages for their receiver or for the recorder"""
     resident_bytes: int | None = None
-    """Of the one process"""
+    """Largest resident memory of a run in one process [bytes]"""
     resident_bytes_robot_max: int | None = None
+    """Largest resident memory of a robot's process [bytes]"""
     processes: Mapping[str, ProcessResult] = field(default_factory=dict)
+    """By name of the process; empty for a run in one process"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,27 +270,40 @@ class Summary:
     """All results of a run."""
 
     format: int
+    """Format of the file; it increases by one whenever a key changes its meaning or is removed"""
     scenario: str
+    """Name of the scenario"""
     seed: int
+    """Seed of all random numbers of the run"""
     robots: int
+    """Number of robots"""
     duration: float
-    """As the scenario asks for"""
+    """Duration in the scenario [s]"""
     simulated: float | None
-    """Up to the last instant that all robots reached"""
+    """The last instant at which all robots have a state [s]; None if there is none"""
     instants: int
-    """At which all robots have a state"""
+    """Number of instants at which all robots have a state"""
     largest_gap: float | None
-    """Between two of those instants [s]"""
+    """Longest time between two of these instants [s]"""
     verdict: Verdict
+    """What the run showed, with all checks"""
     claims: tuple[ClaimResult, ...]
+    """The claims of the scenario, in its order"""
     blocks: tuple[BlockResult, ...]
+    """The blocks, in the order of the plan"""
     separation: tuple[SeparationResult, ...]
+    """Neighbouring time scales compared, the fastest first"""
     distance: DistanceResult
+    """Distances between robots"""
     torque: tuple[TorqueResult, ...]
+    """Wheel torques, by robot"""
     links: tuple[LinkResult, ...]
+    """Messages, by link; empty if they were not counted"""
     can: CanReport | None
-    """None where the run had no bus"""
+    """None if the run had no bus"""
     run: RunFacts
+    """How the run was run"""
     trace_digest: str
+    """SHA-256 over all states of all robots (`results.trace.Digest`)"""
     parts: tuple[PartResult, ...] = ()
-    """That are not built in"""
+    """The laws, plants, trajectories and drive protocols that are not built in"""

@@ -1,4 +1,4 @@
-"""Records as JSON and back, and the schema of summary.json."""
+"""Records written as JSON and read back, and the JSON schema of summary.json."""
 
 import inspect
 import json
@@ -15,7 +15,7 @@ from echelon.sim.results.records import Summary
 
 
 def to_json(value: Any) -> Any:
-    """Returns a record, or what holds records, as values that JSON has; numbers that are not finite become None."""
+    """Returns a record, or a list or mapping of records, as values of JSON; a number that is not finite becomes None."""
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
@@ -38,7 +38,7 @@ def write_summary(summary: Summary, path: Path) -> None:
 
 
 def read_summary(path: Path) -> Summary:
-    """Reads summary.json.  Raises OSError, and ValueError if it is no summary of this format."""
+    """Reads summary.json.  Raises OSError, and ValueError if the file is not a summary in the present format."""
     from pydantic import ValidationError
 
     try:
@@ -73,13 +73,13 @@ def _adapter() -> Any:
 
 def _records() -> list[type]:
     from echelon.bridge import reports
-    from echelon.sim.results import records
+    from echelon.sim.results import records, verdict
 
-    return [value for module in (records, reports) for value in vars(module).values() if is_dataclass(value)]  # type: ignore[misc]
+    return [value for module in (records, verdict, reports) for value in vars(module).values() if is_dataclass(value)]  # type: ignore[misc]
 
 
 def _describe(table: dict[str, Any], record: type) -> None:
-    """Puts the docstrings of a record and of its fields into its part of the schema."""
+    """Puts the docstrings of a record and of its fields into the record's part of the schema."""
     table["description"] = inspect.getdoc(record)
     for name, text in field_docstrings(record).items():
         table["properties"][name]["description"] = text

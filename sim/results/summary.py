@@ -1,4 +1,4 @@
-"""The summary of a run, and its plain-text rendering."""
+"""The summary of a run, and the summary as lines for a terminal."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,9 +8,10 @@ from echelon.bridge.reports import CanReport
 from echelon.runtime.link import LinkCounts
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.can_lines import can_lines
-from echelon.sim.results.checks import Evidence, verdict
+from echelon.sim.results.checks import verdict
 from echelon.sim.results.distances import distances
 from echelon.sim.results.ending import endings
+from echelon.sim.results.evidence import Evidence
 from echelon.sim.results.measures import (
     block_result,
     claim_results,
@@ -30,7 +31,9 @@ def summarise(
     run: RunFacts,
     parts: tuple[PartResult, ...] = (),
 ) -> Summary:
-    """Returns what a run showed.  Nothing is raised for one that diverged, broke off or never began: its verdict says so."""
+    """Returns the summary of a run.  A run that diverged, broke off or never began raises nothing: its verdict says so.
+
+    `can` is None if the run had no bus; `parts` are the parts that are not built in."""
     plan = trace.plan
     blocks = block_series(trace)
     near = distances(trace)
@@ -65,7 +68,7 @@ def summarise(
 
 
 def summary_text(summary: Summary) -> str:
-    """Returns a summary as plain lines for a terminal."""
+    """Returns a summary as lines for a terminal."""
     return "\n".join(_lines(summary))
 
 
@@ -95,7 +98,7 @@ def _lines(summary: Summary) -> Iterator[str]:
     if summary.links:
         sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
         ages = [link.age_max for link in summary.links if link.age_max is not None]
-        oldest = f"oldest in use {number(max(ages), 's')}" if ages else "nothing was ever used"
+        oldest = f"oldest in use {number(max(ages), 's')}" if ages else "no message was used"
         yield f"  links    {sent} messages, {lost} lost, {oldest}"
     yield from can_lines(summary.can)
     run = summary.run
@@ -107,7 +110,7 @@ def _lines(summary: Summary) -> Iterator[str]:
 
 
 def number(value: float | None, unit: str = "", missing: str = "–") -> str:
-    """Returns a number for people, four digits and its unit, or `missing`."""
+    """Returns a number with four digits and its unit, or `missing` for None."""
     if value is None:
         return missing
     return f"{value:.4g} {unit}".rstrip()

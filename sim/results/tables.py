@@ -1,10 +1,11 @@
-"""The tables of a run, one definition for notebook, CSV and Parquet: their names, columns, units and the order of rows.
+"""The tables of a run, which notebooks, CSV and Parquet share: names, columns, units and the order of rows.
 
-robots     every state of every robot, and where the desired formation has it, by time, then robot
-blocks     every component of every block at the instants that all robots share
-links      what became of the messages of each link
-torques    a closed torque path: what each wheel was asked for and did, by torque period (results.torques)
-frames     what was on the buses, decoded (results.frames)
+table      a row for each
+robots     state of a robot, with its desired position, ordered by time, then robot
+blocks     instant at which all robots have a state, block, and component of the block
+links      link, with the counts of its messages
+torques    torque period, robot and wheel on a closed torque path (results.torques)
+frames     frame on a bus, decoded (results.frames)
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,16 +42,17 @@ UNITS: Final[Mapping[str, str]] = MappingProxyType({
     "used": "uses", "held": "uses", "age_mean": "s", "age_max": "s",
     "wanted": "N m", "commanded": "N m", "reported": "N m",
 })  # fmt: skip
-"""Units of all columns that are numbers, of all tables"""
+"""The units of all columns of numbers in all tables"""
 DESIRED: Final = ("x_desired", "y_desired")
 LINK_KEYS: Final = ("source", "receiver", "channel")
 PARTS: Final = ("value", "desired", "error", "rate", "error_rate")
-"""What a block says of each of its components"""
+"""The columns of a block's component, fields of `BlockSeries`"""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: columns of the same length by name, numbers or text; `keys` are those that tell its rows apart."""
+    """A table: columns of the same length by name, numbers or text.  No two rows have the same values in all columns of `keys`,
+    except in the table `frames`, where two frames may have the same time and identifier."""
 
     name: str
     keys: tuple[str, ...]
@@ -58,22 +60,22 @@ class Table:
 
     @property
     def units(self) -> dict[str, str]:
-        """The units of its columns that are numbers."""
+        """The units of the columns of numbers, by column."""
         return {column: UNITS[column] for column in self.columns if column in UNITS}
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
     def to_pandas(self) -> "DataFrame":
-        """Returns it as a data frame whose index is its keys.  Raises ImportError without pandas, which this package does not
-        install."""
+        """Returns the table as a data frame with `keys` as index.  Raises ImportError if pandas is not installed; this package
+        does not install it."""
         from pandas import DataFrame
 
         return DataFrame(dict(self.columns)).set_index(list(self.keys))
 
 
 def robots_table(trace: Trace) -> Table:
-    """Returns all states of all robots by time, then robot."""
+    """Returns all states of all robots with their desired positions, ordered by time, then robot."""
     times_ns = np.concatenate(trace.times_ns)
     robots = np.repeat(np.arange(len(trace.times_ns)), [len(times) for times in trace.times_ns])
     order = np.lexsort((robots, times_ns))
@@ -87,12 +89,12 @@ def robots_table(trace: Trace) -> Table:
 
 
 def desired_places(trace: Trace) -> list[Array]:
-    """Returns of each robot where the desired formation has it at each of its instants [m], (T_i, 2): its part of
-    Φ_M⁻¹ Z_d(t), with the desired shapes and the centroid's trajectory."""
+    """Returns for each robot its desired positions [m], (T_i, 2), at its T_i instants: its part of Φ_M⁻¹ Z_d(t), where Z_d has
+    the desired shapes and the desired trajectory of the centroid (docs/architecture.md, 2.3)."""
     transformation = Transformation(trace.plan)
     trajectory = make_trajectory(trace.plan.trajectory)
     shape, centroid = transformation.inverse[:, :-1] @ transformation.desired_shape, transformation.inverse[:, -1]
-    sampled: dict[bytes, Array] = {}  # robots mostly have the same instants
+    sampled: dict[bytes, Array] = {}  # most robots have the same instants
     places = []
     for robot, times_ns in enumerate(trace.times_ns):
         key = times_ns.tobytes()
@@ -103,7 +105,7 @@ def desired_places(trace: Trace) -> list[Array]:
 
 
 def blocks_table(blocks: Blocks) -> Table:
-    """Returns all components of all blocks by time, block and component."""
+    """Returns all components of all blocks, ordered by time, block and component."""
     names = [(series.block.name, component) for series in blocks.series for component in component_names(series.block)]
     instants = len(blocks.times_ns)
     block, component = (np.tile(np.array(column, dtype=object), instants) for column in zip(*names, strict=True))
@@ -114,7 +116,7 @@ def blocks_table(blocks: Blocks) -> Table:
 
 
 def links_table(links: Sequence[LinkResult]) -> Table:
-    """Returns one row for each link."""
+    """Returns a row for each link: the fields of `LinkResult`."""
     kinds = dict.fromkeys(LINK_KEYS, object) | dict.fromkeys(("age_mean", "age_max"), float)
     columns = {
         field.name: np.array([getattr(link, field.name) for link in links], dtype=kinds.get(field.name, int))

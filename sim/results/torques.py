@@ -1,4 +1,4 @@
-"""Torques on a closed torque path: wanted by the robot, commanded on the bus, reported by the drive."""
+"""The table of torques on a closed torque path: wanted by the robot, commanded on the bus, reported by the drive."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final
@@ -18,22 +18,25 @@ TAUS: Final = field_index(TORQUE_FIELDS, "tau_right", "tau_left")
 COMMAND: Final = TORQUE_FIELDS.index("commanded")
 WAYS: Final = ("wanted", "commanded", "reported")
 
-Said = tuple[NDArray[np.int64], Array]
-"""The instants [ns] at which a robot said its torques, (T,), and what it said, (T, len(TORQUE_FIELDS))"""
+Wanted = tuple[NDArray[np.int64], Array]
+"""The instants of a robot's torque messages [ns], (T,), and their values, (T, len(TORQUE_FIELDS))"""
 
 
-def torques_table(plan: Plan, said: Sequence[Said], frames: Iterable[BusFrame]) -> Table:
-    """Returns a row for each torque period, robot and wheel, in this order; `t` is the period's beginning.
+def torques_table(plan: Plan, wanted: Sequence[Wanted], frames: Iterable[BusFrame]) -> Table:
+    """Returns a row for each torque period, robot and wheel, in this order; `t` is the beginning of the period [s].
 
-    `wanted` is what the robot asks for at `t`; NaN if it has nothing to go by.  `commanded` is what the bus carried in the
-    period: what the drive hears.  `reported` is what the drive said in the period: its mean of the period before.  Of several
-    in a period the last counts; NaN if there was none.  `said` is by robot, `frames` are in order of time."""
+    column       torque [N m]; NaN if there is none in the period, the last one if there are several
+    wanted       computed by the robot at `t`; NaN as well if the robot has no command to compute it from
+    commanded    in the frame on the bus that commands the drive
+    reported     in the frame on the bus from the drive: with most protocols its mean over the period before
+
+    `wanted` has the messages of each robot, in the order of the plan; `frames` must be in order of time."""
     assert plan.bridge is not None
     period_ns = plan.bridge.period_ns
-    rows = [times_ns // period_ns for times_ns, _ in said]
+    rows = [times_ns // period_ns for times_ns, _ in wanted]
     periods = min(max((int(row.max()) + 1 for row in rows if len(row)), default=0), plan.duration_ns // period_ns + 1)
     torques = np.full((len(WAYS), periods, len(plan.robots), len(WHEELS)), np.nan)
-    for robot, (row, (_, values)) in enumerate(zip(rows, said, strict=True)):
+    for robot, (row, (_, values)) in enumerate(zip(rows, wanted, strict=True)):
         asked, inside = np.where(values[:, [COMMAND]] == 1.0, values[:, TAUS], np.nan), (row >= 0) & (row < periods)
         torques[0, row[inside], robot] = asked[inside]
     _listen(plan, frames, period_ns, torques)
@@ -49,7 +52,7 @@ def torques_table(plan: Plan, said: Sequence[Said], frames: Iterable[BusFrame]) 
 
 
 def _listen(plan: Plan, frames: Iterable[BusFrame], period_ns: int, torques: Array) -> None:
-    """Notes commands and reports on the buses, each in the period it came in."""
+    """Fills in the commanded and reported torques, each in the period in which its frame was on the bus."""
     _, commanded, reported = torques
     listeners: dict[tuple[int, int], list[int]] = {}
     observers = [make_observer(robot, plan.can.closed) for robot in plan.robots]

@@ -14,17 +14,19 @@ from rich.text import Text
 
 from echelon.controller.transformation import Transformation
 from echelon.plan.plan import Plan
-from echelon.sim.processes.supervisor import Progress
+from echelon.sim.processes.outcome import Progress
 from echelon.sim.results.desired import Desired
 
 PLAIN_S = 2.0
-"""Time between two plain lines."""
+"""Time between two plain lines [s]"""
 FAULTS = 3
-"""How many faults of drives are shown in words."""
+"""How many faults of drives are named; further ones are shown as …"""
 
 
 class Display:
-    """Shows progress on standard error.  `show` may be called at any rate."""
+    """Shows the progress of a run on a stream, by default standard error; nothing but notes if `quiet`.
+
+    `show` may be called at any rate."""
 
     def __init__(self, plan: Plan, stream: TextIO = sys.stderr, quiet: bool = False) -> None:
         self._plan = plan

@@ -1,4 +1,4 @@
-"""`echelon analyse`: what it says of a scenario's links, held against runs; what it refuses; `validate` and its warnings."""
+"""`echelon analyse`: its results for a scenario's links agree with runs; what it refuses.  Warnings of `echelon validate`."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ velocity = [0.2, 0.0]
 
 
 def last_errors(text: str, *overrides: str) -> list[float]:
-    """Returns the largest error of any block in each quarter of a run in this process; NaN where robots were lost."""
+    """Returns the largest error of any block in each quarter of a run in this process [m]; NaN if a state is not finite."""
     _, plan = parse(text, "t.toml", overrides)
     builder = TraceBuilder(plan)
     with np.errstate(all="ignore"):
@@ -50,7 +50,7 @@ def test_the_first_line_says_of_which_channels_and_periods_it_speaks() -> None:
     assert first == (
         "multi: channels state, group_state, reference and command; accelerations every 2 ms, torques every 1 ms"
     )
-    assert rest[0] == "  delays of the scenario's links: none; none of them loses anything"
+    assert rest[0] == "  delays of the scenario's links: none; no link loses messages"
 
 
 def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_milliseconds() -> None:
@@ -70,7 +70,7 @@ def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_millisecon
 
 
 def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
-    """A new scenario with 0.2 s on every link does not settle, nor does its run; with half of that both do."""
+    """With a delay of 0.2 s on every link neither prediction nor run settles; with half of that both do."""
     text = scenario_text("new", sizes("2x3"), None)
     for delay, settles in ((0.2, False), (0.1, True)):
         rule = f"links=[{{delay={delay}}}]"
@@ -119,7 +119,7 @@ def test_links_that_are_not_treated_are_named_and_no_margin_is_printed(rule: str
     assert (done.returncode, done.stdout) == (2, "")
     assert (
         done.stderr
-        == f"echelon: lab: cannot be analysed, only run: {named}: only constant delays without loss are treated\n"
+        == f"echelon: lab: cannot be analysed; run it instead: {named}: only constant delays without loss are treated\n"
     )
 
 

@@ -1,4 +1,4 @@
-"""The command line as a user types it: what it leaves, what it says, how it ends."""
+"""Commands as a user types them: the files they write, their output, their exit codes."""
 
 import csv
 import json
@@ -167,7 +167,14 @@ def test_no_room_for_the_first_file_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_bus_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
-    options = ("--can", "socketcan:lo", "--quiet", "--json", "--out", tmp_path)  # an interface, but none of CAN
+    options = (
+        "--can",
+        "socketcan:lo",
+        "--quiet",
+        "--json",
+        "--out",
+        tmp_path,
+    )  # lo is not a CAN interface
     done = echelon("run", "paper", *QUICK, *options)
     assert done.returncode == 3
     assert len(done.stderr.splitlines()) == 1
@@ -249,6 +256,26 @@ def test_export_goes_into_the_runs_folder_and_says_so(folder: Path, tmp_path: Pa
     assert refused.stderr == f"echelon: --csv {run}/run.mcap: File exists\n"
 
 
+def test_export_overwrites_tables_only_where_it_is_told_to(folder: Path, tmp_path: Path) -> None:
+    run, tables = tmp_path / "run", tmp_path / "tables"
+    shutil.copytree(folder, run)
+    tables.mkdir()
+    (tables / "links.csv").write_text("mine")
+    says = "holds links.csv already; give another folder, or --replace to overwrite\n"
+    for arguments in (("--csv", tables), ("--parquet", tmp_path / "parquet", "--csv", tables)):
+        done = echelon("export", run, *arguments)
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"echelon: --csv {tables}: {says}")
+    assert [path.name for path in tables.iterdir()] == ["links.csv"]
+    assert (tables / "links.csv").read_text() == "mine"
+    assert not (tmp_path / "parquet").exists()
+    assert echelon("export", run, "--csv", tables, "--replace").returncode == 0
+    assert (tables / "links.csv").read_text().startswith("source,")
+    assert echelon("export", run).returncode == 0
+    again = echelon("export", run)  # the same holds for the default folder
+    assert (again.returncode, again.stdout) == (2, "")
+    assert again.stderr.startswith(f"echelon: {run}/csv: holds robots.csv, blocks.csv, ")
+
+
 def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "both.html"
     assert echelon("report", folder, folder, "--out", page).returncode == 0
@@ -274,7 +301,7 @@ def test_figures_are_files_of_the_formats_that_are_asked_for(folder: Path, tmp_p
     names = {Path(path).name for path in facts["figures"]}
     assert {"compared-errors.svg", "short (1)-errors.svg", "short (2)-errors.svg"} <= names
     assert len(names) == 4 + 5 + 5
-    says = "echelon: --format pdf: is of the files of --figures DIR\n"
+    says = "echelon: --format pdf: needs --figures DIR, which writes the figures as files\n"
     assert echelon("report", folder, "--format", "pdf").stderr == says
 
 
@@ -282,7 +309,7 @@ def test_a_report_overwrites_reports_alone_unless_it_is_told_to(folder: Path, tm
     page = tmp_path / "report.html"
     page.write_text("<html>mine</html>")
     done = echelon("report", folder, folder, cwd=tmp_path)
-    says = "echelon: report.html: is there, and no report of echelon's; give another file with --out\n"
+    says = "echelon: report.html: exists, and echelon did not write it; give another file with --out\n"
     assert (done.returncode, done.stderr) == (2, says)
     assert page.read_text() == "<html>mine</html>"
     for arguments in (("--out", "report.html"), ()):

@@ -1,4 +1,4 @@
-"""Commands about scenarios: where they come from, which are shipped, how one begins, what their keys are."""
+"""Commands about scenarios: sources of scenarios, shipped scenarios, new scenarios, the schema of their keys, DBCs."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# Where scenarios come from
+# Sources of scenarios
 
 
 def test_a_scenario_comes_from_standard_input() -> None:
@@ -75,7 +75,7 @@ def test_the_folder_of_a_run_stands_for_its_scenario(folder: Path, tmp_path: Pat
     assert json.loads(echelon("analyse", folder, "--json").stdout)["scenario"] == "lab"
     assert echelon("dbc", folder).stdout == (folder / "torque.dbc").read_text()
     drives = echelon("drives", folder, "--can", "none")
-    assert "drives without a bus to others" in drives.stderr
+    assert "drives need a bus that other processes can use" in drives.stderr
 
 
 def test_a_run_may_go_into_the_folder_that_it_comes_from(folder: Path, tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_all_mistakes_are_told_and_it_is_exit_code_2(tmp_path: Path) -> None:
     ]
 
 
-# Which are shipped
+# Shipped scenarios
 
 
 def test_scenarios_are_listed_with_what_they_show() -> None:
@@ -118,11 +118,11 @@ def test_scenarios_are_listed_with_what_they_show() -> None:
     assert all(line.endswith(row["description"]) for line, row in zip(lines, rows, strict=True))
 
 
-# A scenario to begin with
+# New scenarios
 
 
 def verdict(text: str) -> dict[str, Any]:
-    """Returns the summary of a scenario that is run in this process."""
+    """Runs a scenario in this process; returns its summary."""
     _, plan = parse(text, "t.toml")
     builder = TraceBuilder(plan)
     engine = Engine(plan, builder.add)
@@ -165,7 +165,7 @@ def test_new_writes_a_file_and_replaces_none(tmp_path: Path) -> None:
     (tmp_path / "my.toml").write_text("mine")
     again = echelon("new", "my", cwd=tmp_path)
     assert again.returncode == 2
-    assert again.stderr == "echelon: my.toml: is there already; --force replaces it\n"
+    assert again.stderr == "echelon: my.toml: exists already; --force overwrites it\n"
     assert (tmp_path / "my.toml").read_text() == "mine"
     assert echelon("new", "my", "--force", cwd=tmp_path).returncode == 0
     assert (tmp_path / "my.toml").read_text() == scenario_text("my", (3, 3), None)
@@ -179,11 +179,11 @@ def test_what_is_new_runs_as_processes(tmp_path: Path) -> None:
     assert (summary["can"]["referee"]["kinds"], summary["verdict"]["word"]) == ({}, "HOLDS")
 
 
-# What their keys are
+# Schema of the keys
 
 
 def tables(schema: dict[str, Any]) -> dict[str, Any]:
-    """Returns the tables of a schema."""
+    """Returns the schemas of all tables in a schema, by their names."""
     return {"Scenario": schema, **schema["$defs"]}
 
 

@@ -1,4 +1,4 @@
-"""Virtual drives alone on a bus: what they say of themselves, and that a host can command them."""
+"""`echelon drives`: virtual drives alone on a bus, what the command prints, and that a host can command them."""
 
 import json
 import signal
@@ -19,7 +19,7 @@ PATIENCE_S = 20.0
 
 
 def own_bus() -> Bus:
-    """A bus that nobody else has."""
+    """A bus with a URL that no other process uses."""
     try:
         return open_bus(resolve_url("auto") if not Path("/sys/class/net/vcan0").exists() else "udp_multicast::47131")
     except OSError as error:
@@ -43,7 +43,7 @@ def turn_wheels(bus: Bus, host: Host, period_ns: int) -> None:
 
 
 def lines_until(command: Popen[str], wanted: str) -> list[str]:
-    """Returns what a command says, up to a line that has something."""
+    """Returns the lines that a command prints, up to the first that contains `wanted`."""
     assert command.stdout is not None
     lines = []
     for line in command.stdout:

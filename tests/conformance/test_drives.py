@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from echelon.bridge.protocols.faults import LATCHING, ON_DEMAND, Fault
 from echelon.bridge.protocols.frame import Drive, Frame, Host
-from echelon.bridge.protocols.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.protocols.motor import Motor
 from echelon.bridge.protocols.protocol import DriveProtocol
 from echelon.plan.can_plan import DrivePlan
 from support.bench_drives import MS, drive_plan, motor_plan

@@ -192,7 +192,7 @@ def test_map_is_the_loop_itself_pushed_by_unit_vectors(delay_ticks):
 
 
 def numbers(*of_e_rate_and_integral: float) -> LinearGains:
-    """Returns gains that are numbers."""
+    """Returns scalar gains as a block has them."""
     return LinearGains(*(np.array([[gain]]) for gain in of_e_rate_and_integral), np.eye(1))
 
 

@@ -43,7 +43,8 @@ def random_plan(tree, seed: int, T: float) -> Plan:
 
 
 def run(plan: Plan, delay_ticks: int, ticks: int) -> Array:
-    """Returns |(e, T ė)| tick by tick of points that do exactly what the central law tells them, from old states."""
+    """Returns |(e, T ė)| at each tick for points that have exactly the accelerations of the central law, computed from states
+    that are `delay_ticks` old."""
     T = plan.root.period_ns * 1e-9
     rest = Part("line", {}, None, Line(velocity=(0.0, 0.0)))
     central, random = CentralLaw(replace(plan, trajectory=rest)), np.random.default_rng(1)
@@ -83,7 +84,8 @@ def histories(plan: Plan, delay_ticks: int) -> Array:
 @SETTINGS
 @given(trees(max_depth=3, max_robots=6), SEEDS, st.integers(0, 5), st.sampled_from([0.01, 0.1, 0.4]))
 def test_radius_is_that_of_the_map_on_histories(tree, seed, delay_ticks, T):
-    """Matrix gains tie x to y, K̄ ties all blocks; both ways of writing the loop have one spectrum but for zeros."""
+    """Matrix gains couple x and y, K̄ couples all blocks; the two ways to write the loop have the same spectrum apart from
+    zeros."""
     plan = random_plan(tree, seed, T)
     expected = np.abs(np.linalg.eigvals(histories(plan, delay_ticks))).max()
     assert radius_of(plan, delay_ticks) == pytest.approx(expected, rel=1e-6)
@@ -92,7 +94,7 @@ def test_radius_is_that_of_the_map_on_histories(tree, seed, delay_ticks, T):
 @SETTINGS
 @given(trees(max_depth=3, max_robots=6), SEEDS, st.sampled_from([0.02, 0.1]))
 def test_parts_that_do_not_act_on_each_other_change_nothing(tree, seed, T):
-    """Without coupling, and with gains that are numbers, the whole falls into parts; its radius is their largest."""
+    """Without coupling and with scalar gains the loop falls into parts; its spectral radius is the largest of theirs."""
     random = np.random.default_rng(seed)
     law = random_epsilon(tree, random)
     plan = plan_of(scenario(tree, random, law=law, duration=T, periods={"acceleration": T, "torque": T}))
@@ -147,8 +149,8 @@ def test_margin_puts_a_root_on_the_axis(K1, K2):
 
 @pytest.mark.parametrize(("k1", "k2"), [(1.0, 1.0), (2.0, 0.8)])
 def test_boundary_tends_to_the_continuous_margin(k1, k2):
-    """Held for T the answer is T/2 older on average: the largest delay is τ* - T/2, to a tick, whatever the lead does
-    beyond; so it tends to τ* as T falls."""
+    """A command that is held for T is T/2 older on average, so without lead the largest delay is τ* - T/2, up to a tick.  With
+    and without lead it tends to τ* as T falls."""
     tau = margin_of(k1, k2)
     for T in (0.04, 0.02, 0.01):
         found = largest_delay_of(single(T, 0.0, k1, k2))
@@ -172,7 +174,7 @@ def test_too_slow_a_period_is_unstable_without_any_delay():
 
 
 def test_axes_may_be_coupled_by_gains():
-    """A gain that turns the error by an angle eats phase: stability ends where the margin is used up."""
+    """A gain that turns the error by an angle reduces the phase margin: stability ends where none is left."""
 
     def turned(angle: float) -> Plan:
         plan = single(0.01)
@@ -312,7 +314,7 @@ def test_margin_with_periods_of_different_length_is_where_points_begin_to_grow(c
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_every_delay_up_to_the_margin_is_stable_and_the_next_is_not(channel, seed):
-    """The criterion that tries no delay out, against the map at every delay; some links are late already."""
+    """The frequency criterion, which tries no delays, against the map at every delay; some links have delays from the start."""
     random = np.random.default_rng(seed)
     plan = random_plan(TREE, seed, float(random.choice([0.02, 0.05, 0.2])))
     delays = random.choice([0, 0, plan.root.period_ns // 3, plan.root.period_ns], size=len(plan.links))

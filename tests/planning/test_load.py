@@ -339,8 +339,8 @@ def test_all_overrides_that_cannot_be_applied_are_reported():
 def test_a_mistake_that_all_robots_inherit_is_reported_once():
     text = BASE.replace("mass = 10.0\n", "").replace("arm = 0.4\n", "").replace("epsilon = [0.1]", "")
     missing = "missing (neither here, nor in its group, nor in [robot]); the same holds for 1 more"
-    assert lines(text) == [
-        f"t.toml: formation.robots.a.mass: {missing}",
+    assert lines(text)[1:] == [
+        f"  formation.robots.a.mass: {missing}",
         f"  formation.robots.a.arm: {missing}",
     ]
     # Mistakes in the tree come first.
@@ -350,6 +350,44 @@ def test_a_mistake_that_all_robots_inherit_is_reported_once():
     ]  # fmt: skip
     assert heavy[2].startswith("  formation.robots.a.inertia = 0.1: ")
     assert heavy[2].endswith("must be larger than mass·offset² = 0.4; the same holds for 1 more")
+
+
+NEEDED = ("mass = 10.0", "inertia = 0.5", "wheel_radius = 0.1", "arm = 0.4", "offset = 0.2", "start = [1.0, 0.0]")
+
+
+@pytest.mark.parametrize("given", NEEDED)
+@pytest.mark.parametrize(
+    ("other", "line"),
+    [
+        ("duration=0", "duration = 0: must be greater than 0"),
+        ("duration=0.015", "duration = 0.015: must be a multiple of 0.01"),
+        ("links=[{source='q'}]", "links.0.source = 'q': fits no member"),
+        ("periods.torque=0.003", "periods.torque = 0.003: must divide"),
+    ],
+)
+def test_a_missing_key_of_a_robot_is_reported_with_all_other_mistakes(given, other, line):
+    key, robot = given.split(" = ")[0], "b" if given.startswith("start") else "a"
+    first, missing = lines(BASE.replace(given, ""), other)
+    assert first.startswith(f"t.toml with --set {other}: {line}")
+    assert missing.startswith(
+        f"  formation.robots.{robot}.{key}: missing (neither here, nor in its group, nor in [robot])"
+    )
+
+
+@pytest.mark.parametrize("given", NEEDED[:-1])
+@pytest.mark.parametrize("table", ["robot", "formation.robot", "formation.robots.a"])
+def test_a_key_of_a_robot_may_stand_on_any_level(given, table):
+    key, value = given.split(" = ")
+    robots = ("a", "b") if table.endswith("a") else ("a",)
+    overrides = [f"{table.replace('.a', f'.{robot}')}.{key}={value}" for robot in robots]
+    assert said(BASE.replace(given, ""), *overrides) == ""
+
+
+@pytest.mark.parametrize("table", ["robot", "formation.robot", "formation.robots"])
+def test_tables_of_robots_that_are_no_tables_are_one_mistake(table):
+    text = BASE.replace("[robot]\n", "[other]\n") if table == "robot" else BASE
+    found = [line for line in lines(text, f"{table}=3") if "other" not in line]
+    assert found == [f"t.toml with --set {table}=3: {table} = 3: must be a table"]
 
 
 def test_an_error_shows_a_limited_number_of_lines():

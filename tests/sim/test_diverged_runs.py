@@ -1,4 +1,4 @@
-"""Runs that diverge stop, runs that are interrupted end between two instants, and both leave a folder that says so."""
+"""Runs that diverge stop, and runs that are interrupted end between two instants.  Both leave a folder that says so."""
 
 import json
 import signal
@@ -8,21 +8,21 @@ from typing import Any
 import pytest
 
 from echelon.cli import main
-from echelon.cli.listening import show_growing
+from echelon.cli.showing import show_growing
 from echelon.sim.interruption import interruption
 from echelon.sim.run_folder import open_run
 from echelon.sim.run_state import goes_on, read_state
 from support.runs import echelon, plan_of, start_echelon, summary_of, until
 
 DIVERGING = ("--set", "claims=[]", "--set", "links=[{channel='state', delay=0.007}]", "--set", "duration=2.0")
-"""The paper's robots bear 6 ms (`echelon analyse paper`)"""
+"""A delay with which the paper's formation does not settle: it tolerates up to 6 ms (`echelon analyse paper`)"""
 QUIET = ("--can", "none", "--quiet", "--no-report")
 CLOSED = ("--set", "can.path=closed", "--set", "claims=[]", "--quiet", "--no-report")
 
 
 def ran(engine: str, folder: Path, *options: str) -> dict[str, Any]:
     done = echelon("run", "paper", "--engine", engine, *DIVERGING, *QUIET, "--out", folder, *options)
-    assert done.returncode == 1, done.stderr  # nothing failed; the verdict does
+    assert done.returncode == 1, done.stderr  # the run did not fail, but its verdict does
     assert not [line for line in done.stderr.splitlines() if "Warning" in line]
     return summary_of(folder)
 
@@ -48,14 +48,14 @@ def test_processes_stop_with_the_same_states(in_process: tuple[dict[str, Any], P
     summary = ran("processes", tmp_path / "run")
     assert summary["trace_digest"] == in_process[0]["trace_digest"]
     assert summary["run"]["stopped"] == in_process[0]["run"]["stopped"]
-    assert min(row["sent"] for row in summary["links"]) > 0  # what links counted is told though the run broke off
+    assert min(row["sent"] for row in summary["links"]) > 0  # the counts of links are kept although the run stopped
 
 
 @pytest.mark.parametrize("engine", ["inprocess", "processes"])
 def test_the_bus_of_a_stopped_run_is_judged_up_to_the_stop_and_the_cause_is_told_first(
     engine: str, tmp_path: Path
 ) -> None:
-    """Processes run ahead of the stop, some further than others: what they no longer send then is no finding."""
+    """When a run stops, some processes are further ahead than others.  Frames that are therefore missing are no findings."""
     folder = tmp_path / "run"
     delay = ("--set", "duration=2", "--set", "links=[{channel='state', delay=0.1}]")
     done = echelon("run", "paper", "--engine", engine, *delay, "--no-report", "--out", folder)
@@ -66,9 +66,13 @@ def test_the_bus_of_a_stopped_run_is_judged_up_to_the_stop_and_the_cause_is_told
     stop = f"up to {summary['simulated']:g} s, where the run was stopped"
     assert checks["referee"]["text"].endswith(stop)
     assert summary["can"]["referee"]["until"] == summary["simulated"]
+    times_s = [float(line.partition(")")[0][1:]) for line in (folder / "can.log").read_text().splitlines()]
+    later = sum(time_s > summary["simulated"] for time_s in times_s)
+    assert summary["can"]["referee"]["later"] == later == len(times_s) - summary["can"]["referee"]["frames"] > 0
+    assert f"can.log and the numbers of the buses include {later} later frames, which are not judged" in done.stdout
     said = [line.split(maxsplit=2)[1] for line in done.stdout.splitlines() if line.startswith("  because  ")]
     assert said[:2] == ["whole:", "finite:"]
-    assert main(["referee", str(folder)]) == 0  # who looks again finds nothing, either
+    assert main(["referee", str(folder)]) == 0  # a second judgement has no findings, either
 
 
 def test_keep_going_goes_on(in_process: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
@@ -80,7 +84,7 @@ def test_keep_going_goes_on(in_process: tuple[dict[str, Any], Path], tmp_path: P
 
 
 def interrupted(folder: Path, scenario: str, *options: str) -> dict[str, Any]:
-    """Interrupts a run in one process once it has written some hundred frames; returns its summary."""
+    """Interrupts a run in one process after it has written some hundred frames; returns its summary."""
     run = ("--engine", "inprocess", "--set", "duration=1000", *options)
     command = start_echelon("run", scenario, *run, *CLOSED, "--out", folder)
     log = folder / "can.log"
@@ -100,7 +104,7 @@ def test_the_frames_of_our_own_stop_are_no_findings(scenario: str, tmp_path: Pat
     assert outcomes["recording"]["outcome"] == "passed", outcomes["recording"]
     assert [check["name"] for check in summary["verdict"]["checks"] if check["outcome"] == "failed"] == ["whole"]
     assert outcomes["whole"]["text"] == f"interrupted (at {summary['simulated']:g} s of 1000 s)"
-    assert main(["referee", str(tmp_path / "run")]) == 0  # who looks again finds nothing, either
+    assert main(["referee", str(tmp_path / "run")]) == 0  # a second judgement has no findings, either
 
 
 def test_an_interruption_is_noted_first_and_raised_the_second_time() -> None:

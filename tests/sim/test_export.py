@@ -1,4 +1,4 @@
-"""The tables of a run: as CSV, Parquet and data frames they are the same; every float reads back as the float it was."""
+"""The tables of a run are the same as CSV, Parquet and data frames; every float is read back exactly."""
 
 import csv
 import json
@@ -63,8 +63,7 @@ def test_robots_read_back_exactly(run, folder):
 
 
 def test_desired_places_make_the_desired_formation(run, folder):
-    """Seen through the transformation they are the desired shapes and the desired centroid; each robot is off by what the
-    errors of the blocks make of it."""
+    """The transformation of the desired places gives the desired shapes and the desired centroid."""
     found, (times_ns, _) = rows(folder / "robots.csv"), run.trace.common()
     places = np.array([(float(row["x_desired"]), float(row["y_desired"])) for row in found])
     places = places.reshape(len(times_ns), -1, 2)
@@ -156,9 +155,9 @@ def test_torques_are_wanted_then_commanded_then_reported(closed, tables):
             wanted, commanded, reported = (
                 np.array([float(row[way]) for row in mine]) for way in ("wanted", "commanded", "reported")
             )
-            # in the first 0.5 s no gate limits these torques: on the bus they are what is wanted, in steps of the protocol
+            # in the first 0.5 s no limit acts: the torques on the bus are the wanted ones, rounded to the protocol's resolution
             np.testing.assert_allclose(commanded, wanted, atol=0.51 * steps[protocols[robot]])
-            # what a drive reports in a period is what the plant had in the period before
+            # a drive reports the torque that acted in the period before
             np.testing.assert_allclose(reported[1:], states[f"tau_{wheel}"][1:], atol=1e-12)
             assert np.abs(wanted).max() > 0.001
 
@@ -172,7 +171,7 @@ def test_frames_are_those_of_the_log_decoded(closed, tables):
         assert row["bus"] == bus
         assert f"{row['identifier'][2:]}#{row['data']}" == frame.rstrip("012345678") if "R" in frame else frame
         assert float(row["t"]) == pytest.approx(float(stamp[1:-1]) - closed.plan.can.bring_up_ns / 1e9, abs=1e-9)
-    assert found[0]["t"].startswith("-")  # drives are brought up before
+    assert found[0]["t"].startswith("-")  # drives are brought up before run time 0
     torque = next(row for row in found if row["name"] == "g2_r4_right_Set_Input_Torque" and float(row["t"]) >= 0)
     commanded = next(row for row in tables["torques"] if (row["robot"], row["wheel"]) == ("g2/r4", "right"))
     assert json.loads(torque["signals"])["Input_Torque"] == float(commanded["commanded"])

@@ -1,4 +1,4 @@
-"""A run's folder keeps the parts that others wrote: it runs again there, to the same digest, wherever they came from."""
+"""A run's folder keeps the files of users' parts, so that its scenario can be run again from there, with the same digest."""
 
 import hashlib
 import shutil
@@ -38,7 +38,7 @@ USE = (
     'robot.model={use="parts.py:Weak"}',
     'formation.groups.g2.robot.model={use="my/parts.py:Weaker",parameters={share=0.7}}',
 )
-"""Three files of one name"""
+"""Three files with the same name"""
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(scenario: Path, out: Path, *overrides: str, engine: str = "inprocess") -> str:
-    """Runs a scenario to its end; returns the digest."""
+    """Runs a scenario; returns the digest of its trace."""
     sets = [argument for override in overrides for argument in ("--set", override)]
     done = echelon("run", scenario, *sets, "--engine", engine, "--quiet", "--no-report", "--out", out)
     assert done.returncode in (0, 1), done.stderr
@@ -72,7 +72,7 @@ def test_a_runs_folder_runs_again_to_the_same_digest(folder: Path, tmp_path: Pat
     assert run(moved / "scenario.toml", again) == digest
     assert (again / "scenario.toml").read_text() == (moved / "scenario.toml").read_text()
     assert {path.name for path in moved.glob("*.py")} == {"parts.py", "parts-2.py", "parts-3.py"}
-    # It is what others look at, too.
+    # The moved folder can still be read.
     assert echelon("report", moved).returncode == 0
     assert echelon("export", moved, "--csv", tmp_path / "csv").returncode == 0
     assert len((tmp_path / "csv" / "robots.csv").read_text().splitlines()) > 9 * 50
@@ -101,7 +101,7 @@ def test_summary_and_recording_name_the_files_and_their_hashes(folder: Path, tmp
 
 
 def test_nothing_of_a_user_is_overwritten(folder: Path) -> None:
-    """A run into the project's own folder: what lies there already is used, or another name is found."""
+    """A run into the project's own folder: a file with the same text is used; for other files another name is chosen."""
     before = {path: path.read_bytes() for path in folder.rglob("*.py")}
     scenario, _ = load(folder / "mine.toml", USE)
     kept = keep_parts(scenario, folder)
@@ -113,7 +113,7 @@ def test_nothing_of_a_user_is_overwritten(folder: Path) -> None:
 
 
 def test_lines_end_as_they_did(folder: Path) -> None:
-    """The hash is that of the file, byte for byte."""
+    """The noted hash is that of the file's bytes."""
     (folder / "parts.py").write_bytes(PLANT.replace("\n", "\r\n").encode())
     scenario, plan = load(folder / "mine.toml", ['robot.model="parts.py:Weak"'])
     assert plan.robots[0].model.made.share == 0.9

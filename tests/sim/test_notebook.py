@@ -1,4 +1,4 @@
-"""What a notebook calls: the same runs as the command, as arrays with names; and steps in between."""
+"""Functions for notebooks: they give the same runs as the command, as named arrays; and a simulation can be stepped."""
 
 import json
 import subprocess
@@ -73,7 +73,7 @@ def test_what_is_not_there_is_named(lab: echelon.Run) -> None:
 
 
 def test_the_summary_is_in_the_attributes(lab: echelon.Run) -> None:
-    assert (lab.verdict.word, lab.holds, lab.ok) == ("HEALTHY", False, True)  # it claims nothing
+    assert (lab.verdict.word, lab.holds, lab.ok) == ("HEALTHY", False, True)  # the scenario has no claims
     assert lab.failure is None
     assert (lab.scenario, lab.duration, lab.claims) == ("lab", 0.5, ())
     assert lab.distance.smallest > 0
@@ -128,7 +128,7 @@ def test_scenarios_come_from_names_files_tables_and_what_was_loaded(tmp_path: Pa
     [
         ("laab", {}, "laab: no such file, and no shipped scenario; those are "),
         ("lab", {"law.leed": 0.0}, "law.leed: unknown key; did you mean 'lead'?"),
-        ("lab", {"law.lead": None}, "None has no place in a scenario"),
+        ("lab", {"law.lead": None}, "None: must be a number, a string, a boolean"),
         ({"name": "t"}, {}, "scenario: duration: missing"),
         ("lab", {"can.virtual_drives": False, "can.path": "closed"}, "real drives need --clock wall"),
     ],
@@ -162,8 +162,8 @@ def test_steps_are_the_run(path: str) -> None:
 
 @pytest.mark.parametrize("path", ["mirror", "closed"])
 def test_overwritten_commands_are_what_a_robot_does(path: str) -> None:
-    """A robot at rest that is told to accelerate along its heading does so, whatever its leader wants; others do not move for
-    that in this period."""
+    """A robot at rest follows an acceleration along its heading that replaces its leader's command.  In this period the other
+    robots move as without it."""
     changes = {"duration": 0.2, "claims": [], "can.path": path, "robot.torque_rate_limit": float("inf")}
     meddled, left = echelon.Simulation("lab", changes), echelon.Simulation("lab", changes)
     meddled.commands[0] = 0.2, 0.0
@@ -192,7 +192,7 @@ def test_errors_and_states_are_those_of_the_instant() -> None:
     assert simulation.states["theta"][3] == run.robots["g2/r4"]["theta"][10]
 
 
-# Other ways in
+# Scripts, the example notebook, and mistakes
 
 
 @pytest.mark.parametrize("way", ["file", "standard input"])
@@ -236,3 +236,39 @@ def test_an_engine_or_a_clock_that_does_not_exist_is_refused(wrong: dict[str, st
     with pytest.raises(echelon.UserError, match=f"{name} = '{value}': must be "):
         echelon.run("lab", out=tmp_path / "run", quiet=True, **wrong)  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
+
+
+# What was recorded, judged again
+
+
+def test_a_run_is_replayed_with_another_law(lab: echelon.Run) -> None:
+    assert echelon.replay(lab).equal
+    found = echelon.replay(lab, {"law.epsilon": [0.3, 0.6]}, only="coordinator")
+    assert not found.equal
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member, found.roles) == (
+        0.0,
+        "coordinator",
+        ("coordinator",),
+    )
+    other = echelon.load("lab", {**SHORT, "law.epsilon": [0.3, 0.6]})
+    assert echelon.replay(str(lab.folder), scenario=other, only=["coordinator"]).channels == found.channels
+    assert echelon.replay(lab, {"law.epsilon": [0.3, 0.6]}, only="coordinator", tolerance=1e6).equal
+
+
+def test_two_runs_are_compared(lab: echelon.Run, tmp_path: Path) -> None:
+    changed = echelon.run("lab", SHORT | {"law.lead": 0.0}, engine="inprocess", out=tmp_path, quiet=True)
+    assert lab.folder is not None
+    assert echelon.diff(lab, lab.folder).equal
+    found = echelon.diff(lab, changed)
+    assert found.first_difference is not None
+    assert (found.first_difference.member, found.first_difference.time) == ("coordinator", 0.0)
+    assert found.scenario == {"law.lead": ("0.5", "0.0")}
+    assert echelon.diff(lab, changed, tolerance=1e6).equal
+
+
+def test_what_has_no_folder_was_not_recorded() -> None:
+    simulation = echelon.Simulation("lab", SHORT)
+    simulation.run_until(0.05)
+    with pytest.raises(echelon.UserError, match="this run has no folder, so its messages were not recorded"):
+        echelon.replay(simulation.result())

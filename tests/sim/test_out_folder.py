@@ -1,4 +1,4 @@
-"""Folders that runs write into: what earlier runs left goes, what is not of a run stays as it is."""
+"""Folders that runs write into: files of earlier runs are deleted, all other files stay."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def left(lab: Path, tmp_path: Path) -> Path:
-    """What a run left."""
+    """A folder with a finished run."""
     return Path(shutil.copytree(lab, tmp_path / "run"))
 
 
@@ -60,21 +60,21 @@ def test_the_run_of_another_scenario_stays_unless_the_user_says_so(left: Path) -
 @pytest.mark.parametrize("name", run_files(plan_of("drives"), bus=True))
 def test_a_file_in_the_way_stays_as_it_is(name: str, replace: bool, tmp_path: Path) -> None:
     (tmp_path / name).write_text("mine")
-    with pytest.raises(UsageError, match=f"{name} is there"), out_folder("drives", tmp_path, [name], replace):
+    with pytest.raises(UsageError, match=f"{name} exists"), out_folder("drives", tmp_path, [name], replace):
         pass
     assert files(tmp_path) == {name: b"mine"}
 
 
 def test_a_scenario_in_the_way_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "scenario.toml").write_text("mine")
-    says = "scenario.toml is there, and no run of echelon left it; move it away, or give another folder"
+    says = "scenario.toml exists, and no run of echelon wrote it; move it away, or give another folder"
     assert run(".", "lab", "--replace", cwd=tmp_path) == (2, f"echelon: --out .: {says}\n")
     assert files(tmp_path) == {"scenario.toml": b"mine"}
 
 
 def test_a_link_in_the_way_is_a_file_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "can.log").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match=r"can\.log is there"), out_folder("lab", tmp_path, ["can.log"]):
+    with pytest.raises(UsageError, match=r"can\.log exists"), out_folder("lab", tmp_path, ["can.log"]):
         pass
 
 
@@ -82,7 +82,7 @@ def test_a_project_keeps_its_files(tmp_path: Path) -> None:
     mine = {"my.toml": b'name = "my"', "torque-other.dbc": b"mine", "can.blf": b"mine", "notes.txt": b"mine"}
     for name, content in mine.items():
         (tmp_path / name).write_bytes(content)
-    says = ".: not of this run, and left as it is: can.blf, torque-other.dbc\n"
+    says = ".: holds files of other runs, which stay: can.blf, torque-other.dbc\n"
     assert run(".", cwd=tmp_path) == (0, says)
     assert mine.items() <= files(tmp_path).items()
     assert run(".", cwd=tmp_path) == (0, says)
@@ -107,7 +107,7 @@ def test_a_copy_without_the_note_is_known_by_its_recording(left: Path) -> None:
     shutil.copy(left / "run.mcap", left / "run.mcap.cut")
     (left / "run.mcap").write_text("mine")
     (left / "scenario.toml").unlink()
-    assert "run.mcap is there, and no run of echelon left it" in run(left)[1]
+    assert "run.mcap exists, and no run of echelon wrote it" in run(left)[1]
     (left / "run.mcap").unlink()
     assert run(left) == (0, "")
     assert not (left / "run.mcap.cut").exists()

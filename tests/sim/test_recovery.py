@@ -1,4 +1,4 @@
-"""Runs that are killed with all their processes: their folders are rebuilt as far as anything was recorded."""
+"""Folders of runs that were killed with all their processes are rebuilt from what was recorded."""
 
 import json
 import os
@@ -19,11 +19,11 @@ from echelon.sim.run_folder import open_run
 from support.runs import SCENARIOS, echelon, kill_session, plan_of, session_members, start_echelon, summary_of, until
 
 ENOUGH = 300_000
-"""Bytes of a recording that hold a good many states"""
+"""Size of a recording that holds many states [bytes]"""
 
 
 def killed(folder: Path, *arguments: str) -> Path:
-    """Starts a run that would take long, and kills all its processes at once while it is recording."""
+    """Starts a long run, and kills all its processes at the same time while it is recording."""
     command = start_echelon("run", *arguments, "--quiet", "--out", folder)
     recording = folder / "run.mcap"
     try:
@@ -43,7 +43,7 @@ def killed(folder: Path, *arguments: str) -> Path:
 
 @pytest.fixture(scope="module", params=["processes", "inprocess"])
 def left(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a killed run left."""
+    """The folder of a killed run."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
     return killed(folder, "lab", "--engine", request.param, "--set", "duration=3000.0")
 
@@ -85,7 +85,7 @@ def test_what_was_killed_is_rebuilt_in_place(left: Path, tmp_path: Path) -> None
         assert echelon(command, folder).returncode == 0
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     again = echelon("recover", folder)
-    assert (again.returncode, again.stdout) == (0, f"{folder}: is whole, nothing was changed\n")
+    assert (again.returncode, again.stdout) == (0, f"{folder}: nothing is missing, nothing was changed\n")
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 
@@ -99,13 +99,13 @@ def test_files_that_are_missing_or_torn_are_made_anew(left: Path, tmp_path: Path
     whole = log[: log.rindex(b"\n") + 1]
     (folder / "can.log").write_bytes(
         whole + whole.splitlines()[-1][:-6]
-    )  # half a frame, which looks like a shorter one
-    os.replace(folder / "run.mcap", folder / "run.mcap.cut")  # as if killed while it was mended
+    )  # half a frame, which looks like a frame with less data
+    os.replace(folder / "run.mcap", folder / "run.mcap.cut")  # as if an earlier recovery had been killed
     (folder / "summary.json").write_text("{")
     done = echelon("recover", folder)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.endswith(
-        "written anew: run.mcap, run.mcap.cut, scenario.toml, torque.dbc, summary.json, report.html\n"
+        "written: run.mcap, run.mcap.cut, scenario.toml, torque.dbc, summary.json, report.html\n"
     )
     assert (folder / "scenario.toml").read_text() == scenario
     assert (folder / "can.log").read_bytes() == whole
@@ -123,11 +123,11 @@ def test_of_a_run_that_was_recorded_to_its_end_only_what_is_torn_is_mended(torn:
     assert done.returncode == 0
     after = summary_of(tmp_path)
     if torn == "run.mcap":
-        assert done.stdout.endswith("written anew: run.mcap, run.mcap.cut\n")
+        assert done.stdout.endswith("written: run.mcap, run.mcap.cut\n")
         assert after == before
         assert (tmp_path / "run.mcap").read_bytes().endswith(MAGIC)
     else:
-        assert done.stdout.endswith("written anew: summary.json, report.html\n")
+        assert done.stdout.endswith("written: summary.json, report.html\n")
         assert (after["trace_digest"], after["links"]) == (before["trace_digest"], before["links"])
         (reason,) = open_run(tmp_path).summary.verdict.reasons
         assert reason.startswith("whole: broken off before its summary was written")

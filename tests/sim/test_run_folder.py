@@ -1,4 +1,4 @@
-"""What runs are called beside each other."""
+"""Names of runs in a comparison."""
 
 from pathlib import Path
 

@@ -14,8 +14,8 @@ import pytest
 
 from echelon.bridge.can.bus import open_bus
 from echelon.bridge.protocols.cyclic import WheelState
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.native.codec import FaultCode, Feedback, NativeCodec
 from echelon.bridge.protocols.native.drive import NativeDrive
 from echelon.bridge.protocols.native.host import NativeHost

@@ -16,8 +16,8 @@ from odrive_can.mock import ODriveCANMock
 from odrive_can.odrive import CanMsg, DriveError, ODriveCAN
 
 from echelon.bridge.can.bus import open_bus
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.odrive.drive import ODriveDrive
 from echelon.bridge.protocols.odrive.host import ODriveHost
 from support.bench_drives import MS, Bench, drive_plan

@@ -22,8 +22,8 @@ import struct
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 
 NMT_ID = 0x000
 SYNC_ID = 0x080

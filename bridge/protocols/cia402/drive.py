@@ -52,8 +52,9 @@ from echelon.bridge.protocols.cia402.node import Node
 from echelon.bridge.protocols.cia402.objects import Live
 from echelon.bridge.protocols.cia402.pdo import Pdo
 from echelon.bridge.protocols.cia402.sdo import Key
+from echelon.bridge.protocols.faults import LATCHING, ON_DEMAND, Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.protocols.motor import Motor
 from echelon.plan.can_plan import NEVER_NS, DrivePlan
 
 MODES: Final = (MODE_NONE, MODE_PROFILE_TORQUE, MODE_CYCLIC_TORQUE)

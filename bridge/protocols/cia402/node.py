@@ -1,4 +1,5 @@
-"""A CANopen node: network management (NMT), SDO, PDOs, heartbeats and errors.  A device profile is a class derived from it.
+"""A CANopen node: network management (NMT), SDO, heartbeats and errors; its PDOs are in `process_data`.  A device profile is a
+class derived from it.
 
 NMT state          entered when                               what the node does
 BOOT UP            at power-on; NMT reset node; NMT reset     sends its boot-up message, then PRE-OPERATIONAL
@@ -7,13 +8,12 @@ PRE-OPERATIONAL    after boot-up; NMT command                 SDO, heartbeat, em
 OPERATIONAL        NMT start                                  also PDOs
 STOPPED            NMT stop                                   heartbeat only
 
-The host's heartbeat (object 1016) is watched from the first one on.  If it is lost, the profile reacts, and object 1029 decides
-about the NMT state.  By default the NMT state stays, so that the host can see the reason.
+The host's heartbeat (object 1016) is watched from the first one on.  If it is lost, the device reacts (`profile`), and object
+1029 decides about the NMT state.  By default the NMT state stays, so that the host can see the reason.
 
 Frames that are refused are counted by reason.
 """
 
-from collections import Counter
 from collections.abc import Mapping
 
 from echelon.bridge.protocols.cia402 import objects
@@ -33,37 +33,27 @@ from echelon.bridge.protocols.cia402.codec import (
     heartbeat_state,
 )
 from echelon.bridge.protocols.cia402.objects import Dictionary
-from echelon.bridge.protocols.cia402.pdo import COMMUNICATION, MAPPING, Pdo, check_change, pack, pdos
-from echelon.bridge.protocols.cia402.profile import Profile
+from echelon.bridge.protocols.cia402.pdo import COMMUNICATION, MAPPING, check_change
+from echelon.bridge.protocols.cia402.process_data import ProcessData
 from echelon.bridge.protocols.cia402.sdo import LENGTH, Abort, Key, SdoError, SdoServer, abort_code
 from echelon.bridge.protocols.frame import Frame
 from echelon.plan.can_plan import NEVER_NS
 
 MS = 1_000_000
-_STATES = (objects.STATUSWORD, objects.MODE_DISPLAY, objects.ERROR_CODE, objects.ERROR_REGISTER)
-"""Objects whose change triggers a TPDO of type 254 or 255."""
 
 
-class Node(Profile):
+class Node(ProcessData):
     """A node with the id `node`; `values` are those of objects without a default."""
 
     def __init__(self, node: int, values: Mapping[Key, int]) -> None:
+        super().__init__(Dictionary(node, values))
         self.node = node
-        self.nmt = Nmt.BOOT_UP
-        self.refused: Counter[str] = Counter()
-        self._od = Dictionary(node, values)
         self._sdo = SdoServer(self._od.read, self._write)
         self._now_ns = 0
         self._begun = False
         self._due: dict[tuple[str, int], int] = {}
-        """Times [ns] of coming events by kind and number: boot, heartbeat, host (its heartbeat is lost), tpdo (its event timer
-        or inhibit time is over), rpdo (it did not come in time)."""
-        self._out: list[Frame] = []
-        self._waiting: dict[int, list[int]] = {}
-        """Values of RPDOs that wait for SYNC."""
-        self._syncs = 0
-        self._sent: dict[int, tuple[int, list[int]]] = {}
-        """For each TPDO: when it was last sent, and the values then whose change triggers it."""
+        """Times of coming events [ns] by kind and number.  Kinds: `boot`; `heartbeat`; `host`: the host's heartbeat is lost;
+        `tpdo`: the event timer or the inhibit time of a TPDO is over; `rpdo`: an RPDO did not come in time"""
         self._host_lost = False
         self._configure()
 
@@ -86,6 +76,7 @@ class Node(Profile):
         return out
 
     def _pass(self, time_ns: int) -> None:
+        """Lets all events up to and including `time_ns` happen, in order of time."""
         if not self._begun:
             self._begun = True
             self._power_on(time_ns)
@@ -126,6 +117,7 @@ class Node(Profile):
         return out + self.advance(time_ns)
 
     def _happen(self, time_ns: int, what: str, number: int) -> None:
+        """Lets one event of `_due` happen."""
         match what:
             case "boot":
                 self._out.append(heartbeat(self.node, Nmt.BOOT_UP))
@@ -143,27 +135,32 @@ class Node(Profile):
                 self._send(time_ns, self._tpdos[number])
 
     def _set_due(self, what: str, number: int, time_ns: int, after_ns: int) -> None:
-        """Schedules an event `after_ns` after `time_ns`; 0 cancels it."""
         if after_ns:
             self._due[what, number] = time_ns + after_ns
         else:
             self._due.pop((what, number), None)
+
+    def _hasten(self, what: str, number: int, time_ns: int) -> None:
+        self._due[what, number] = min(time_ns, self._due.get((what, number), NEVER_NS))
 
     def _drop_due(self, what: str) -> None:
         for key in [key for key in self._due if key[0] == what]:
             del self._due[key]
 
     def _beat_after(self, time_ns: int) -> None:
+        """Schedules the next heartbeat."""
         self._set_due("heartbeat", 0, time_ns, self._od[objects.PRODUCER_HEARTBEAT] * MS)
 
     # network management
 
     def _power_on(self, time_ns: int) -> None:
+        """Begins as after power-on: all objects have their first values."""
         self._od.reset()
         self._switch_on(time_ns)
         self._boot(time_ns)
 
     def _boot(self, time_ns: int) -> None:
+        """Begins to boot: the node sends its boot-up message next."""
         self.nmt = Nmt.BOOT_UP
         self._host_lost = False
         self._sdo.reset()
@@ -172,6 +169,7 @@ class Node(Profile):
         self._configure()
 
     def _manage(self, time_ns: int, data: bytes) -> None:
+        """Takes an NMT command."""
         if len(data) != 2:
             self.refused["length"] += 1
             return
@@ -206,6 +204,7 @@ class Node(Profile):
             self._rest(time_ns)
 
     def _hear(self, time_ns: int, can_id: int, data: bytes) -> None:
+        """Takes a heartbeat of the host."""
         if heartbeat_state(data) is None:
             self.refused["heartbeat"] += 1
         elif can_id == self._host_id and self._host_ns:
@@ -213,6 +212,7 @@ class Node(Profile):
             self._set_due("host", 0, time_ns, self._host_ns)
 
     def _lose_host(self, time_ns: int) -> None:
+        """Reacts to the loss of the host's heartbeat."""
         self._host_lost = True
         self._without_host(time_ns)
         behaviour = self._od[objects.COMMUNICATION_ERROR]
@@ -236,94 +236,20 @@ class Node(Profile):
         if self.nmt in (Nmt.PRE_OPERATIONAL, Nmt.OPERATIONAL):
             self._out.append(emergency(self.node, code, register))
 
-    # process data
+    # objects
 
     def _configure(self) -> None:
         """Reads the configuration of PDOs, SYNC and the host's heartbeat from the objects."""
+        self._read_pdos()
         od = self._od
-        self._rpdos = {pdo.number: pdo for pdo in pdos(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING)}
-        self._tpdos = {pdo.number: pdo for pdo in pdos(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING)}
-        self._numbers: dict[int, list[int]] = {}
-        for pdo in self._rpdos.values():
-            self._numbers.setdefault(pdo.can_id, []).append(pdo.number)
-        self._unasked = any(not pdo.synchronous for pdo in self._tpdos.values())
         self._sync_id = od[objects.SYNC_COB_ID]
         host = od[objects.CONSUMER_HEARTBEAT]
         self._host_id, self._host_ns = HEARTBEAT_ID + (host >> 16 or HOST_NODE), (host & 0xFFFF) * MS
         fixed = (NMT_ID, SYNC_ID, self._sync_id, HEARTBEAT_ID + HOST_NODE, self._host_id, SDO_REQUEST_ID + self.node)
         self._identifiers = frozenset((*fixed, *self._numbers, *(base + self.node for base in RPDO_IDS)))
 
-    def _begin_pdos(self, time_ns: int) -> None:
-        self._syncs = 0
-        self._waiting.clear()
-        self._sent.clear()
-        self._drop_due("tpdo")
-        for pdo in self._tpdos.values():
-            if not pdo.synchronous:
-                self._set_due("tpdo", pdo.number, time_ns, pdo.timer_ns)
-
-    def _sync(self, time_ns: int, data: bytes) -> None:
-        if len(data) > 1:
-            self.refused["length"] += 1
-        elif self.nmt is Nmt.OPERATIONAL:
-            self._syncs += 1
-            for pdo in self._tpdos.values():
-                if pdo.synchronous and not (pdo.transmission and self._syncs % pdo.transmission):
-                    self._send(time_ns, pdo)
-            waiting, self._waiting = self._waiting, {}
-            for number, values in waiting.items():
-                self._take(time_ns, self._rpdos[number], values)
-
-    def _send(self, time_ns: int, pdo: Pdo) -> None:
-        values = [self._sample(time_ns, key) for key in pdo.keys]
-        if pdo.transmission == 0 and self._sent.get(pdo.number, (0, None))[1] == values:
-            return
-        self._sent[pdo.number] = time_ns, self._states(pdo) if pdo.transmission else values
-        self._out.append(Frame(pdo.can_id, pack(pdo, values)))
-        if not pdo.synchronous:
-            self._set_due("tpdo", pdo.number, time_ns, pdo.timer_ns)
-
-    def _states(self, pdo: Pdo) -> list[int]:
-        return [self._od[key] for key in pdo.keys if key in _STATES]
-
-    def _send_changed(self, time_ns: int) -> None:
-        """Sends the TPDOs of type 254 and 255 whose states have changed, at the end of their inhibit time at the earliest."""
-        if self.nmt is not Nmt.OPERATIONAL:
-            return
-        for pdo in self._tpdos.values():
-            sent_ns, states = self._sent.get(pdo.number, (-NEVER_NS, None))
-            if pdo.synchronous or states == self._states(pdo):
-                continue
-            free_ns = sent_ns + pdo.inhibit_ns
-            if free_ns <= time_ns:
-                self._send(time_ns, pdo)
-            else:
-                self._due["tpdo", pdo.number] = min(free_ns, self._due.get(("tpdo", pdo.number), NEVER_NS))
-
-    def _rpdo(self, time_ns: int, pdo: Pdo, data: bytes) -> None:
-        if self.nmt is not Nmt.OPERATIONAL:
-            self.refused["not operational"] += 1
-        elif len(data) != pdo.layout.size:
-            self.refused["length"] += 1
-        else:
-            values = list(pdo.layout.unpack(data))
-            if not all(self._allowed(key, value) for key, value in zip(pdo.keys, values, strict=True)):
-                self.refused["value"] += 1
-            elif pdo.synchronous:
-                self._waiting[pdo.number] = values
-            else:
-                self._take(time_ns, pdo, values)
-
-    def _take(self, time_ns: int, pdo: Pdo, values: list[int]) -> None:
-        refused = 0
-        for key, value in zip(pdo.keys, values, strict=True):
-            refused += not self._set(time_ns, key, value)
-        if not refused:
-            self._took(time_ns, pdo)
-
-    # objects
-
     def _request(self, data: bytes) -> None:
+        """Takes an SDO request, and sends its answer."""
         if len(data) != LENGTH:
             self.refused["length"] += 1
         elif self.nmt not in (Nmt.PRE_OPERATIONAL, Nmt.OPERATIONAL):

@@ -19,8 +19,9 @@ from collections.abc import Iterable
 from typing import Final
 
 from echelon.bridge.protocols.cyclic.frames import REMOTE, Command, WheelState
+from echelon.bridge.protocols.faults import LATCHING, ON_DEMAND, Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import LATCHING, ON_DEMAND, Fault, Motor
+from echelon.bridge.protocols.motor import Motor
 from echelon.plan.can_plan import NEVER_NS, DrivePlan
 
 FIRST_NOT_ZERO: Final = "first command not zero"

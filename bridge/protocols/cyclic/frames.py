@@ -3,7 +3,7 @@
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from echelon.bridge.protocols.motor import Fault
+from echelon.bridge.protocols.faults import Fault
 
 REMOTE: Final = "remote"
 """The reason to refuse a remote frame: cyclic protocols do not answer them."""

@@ -19,8 +19,8 @@ from math import isfinite
 from typing import Final
 
 from echelon.bridge.protocols.cyclic.frames import REMOTE, Command, Feedback, WheelState, fault_text
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import WHEELS, Frame, recovers_after_ns
-from echelon.bridge.protocols.motor import Fault
 from echelon.plan.can_plan import NEVER_NS, DrivePlan
 
 SILENT: Final = "silent"

@@ -4,8 +4,8 @@ from math import tau
 from typing import Final
 
 from echelon.bridge.protocols.cyclic import Command, CyclicDrive
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.native.codec import (
     BASE_ID,
     FEEDBACK_ID,

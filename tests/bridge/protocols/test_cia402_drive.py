@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from echelon.bridge.protocols.cia402.drive import Cia402Drive
 from echelon.bridge.protocols.cia402.sdo import Abort, SdoClient
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from support.bench_drives import MS, motor_plan
 from support.cia402_rig import plan_of
 

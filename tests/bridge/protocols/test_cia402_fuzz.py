@@ -8,8 +8,8 @@ import pytest
 from echelon.bridge.protocols.cia402.codec import State
 from echelon.bridge.protocols.cia402.drive import Cia402Drive
 from echelon.bridge.protocols.cia402.host import Cia402Host
+from echelon.bridge.protocols.faults import ON_DEMAND
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import ON_DEMAND
 from support.bench_drives import MS
 from support.cia402_rig import Rig, plan_of
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from echelon.bridge.protocols.cia402.host import Cia402Host, Master
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from support.bench_drives import MS, motor_plan
 from support.cia402_rig import PERIOD_NS, Rig, plan_of
 

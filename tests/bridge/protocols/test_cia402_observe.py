@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from echelon.bridge.protocols.cia402.dbc import messages, shared_messages
 from echelon.bridge.protocols.cia402.observe import Cia402Observer
+from echelon.bridge.protocols.faults import LATCHING, Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import LATCHING, Fault
 from echelon.bridge.protocols.observe import Finding
 from support.bench_drives import ENVELOPE, MS, motor_plan
 from support.cia402_rig import PERIOD_NS, Rig, plan_of

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from echelon.bridge.protocols.motor import LATCHING, ON_DEMAND, STEP_NS, Fault, Motor
+from echelon.bridge.protocols.faults import LATCHING, ON_DEMAND, Fault
+from echelon.bridge.protocols.motor import Motor
+from echelon.bridge.protocols.motor_physics import STEP_NS
 from echelon.plan.can_plan import MotorPlan
 from support.bench_drives import MOTOR, MS, motor_plan
 
@@ -24,12 +26,13 @@ def pieces(events: list[tuple[float, float]], end: float, plan: MotorPlan) -> li
         if math.isinf(plan.torque_slew):
             at, ramp = goal, 0.0
         else:
+            # compared as durations: by rounding, start + (stop - start) may be before stop
             ramp = min(abs(goal - at) / plan.torque_slew, stop - start)
         slope = math.copysign(plan.torque_slew, goal - at) if ramp else 0.0
         if ramp:
             found.append((start, start + ramp, at, slope))
-        at = goal if start + ramp < stop else at + slope * ramp
-        if start + ramp < stop:
+        at = goal if ramp < stop - start else at + slope * ramp
+        if ramp < stop - start:
             found.append((start + ramp, stop, at, 0.0))
     return found
 
@@ -54,6 +57,7 @@ event_lists = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(event_lists, st.sampled_from([1e-3, 5e-3, 0.05]), st.sampled_from([5.0, 80.0, math.inf]), st.integers(0, 5))
+@example([(205, 0.0), (1057, 1.0), (1, 0.0)], 1e-3, 5.0, 0)
 def test_torque_mean_and_heat_are_those_of_the_differential_equation(
     steps: list[tuple[int, float]], lag: float, slew: float, asked: int
 ) -> None:

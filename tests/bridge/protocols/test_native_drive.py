@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from echelon.bridge.protocols.cyclic import WheelState
 from echelon.bridge.protocols.cyclic.drive import CAUSE_PERSISTS, FIRST_NOT_ZERO, NOT_CLEARED
 from echelon.bridge.protocols.cyclic.frames import REMOTE
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.native.codec import (
     FaultCode,
     Feedback,

@@ -8,8 +8,8 @@ from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 
 from conformance.test_drives import Rig, enabled_rig
 from echelon.bridge.protocols.cyclic import WheelState
+from echelon.bridge.protocols.faults import LATCHING, Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import LATCHING, Fault
 from echelon.bridge.protocols.native.codec import FaultCode, Feedback, NativeCodec, Status, encode_status
 from echelon.bridge.protocols.native.observe import NativeObserver
 from echelon.bridge.protocols.observe import Finding

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import Fault
 from echelon.bridge.protocols.odrive.config import ODriveConfig
 from echelon.bridge.protocols.odrive.drive import ODriveDrive
 from echelon.bridge.protocols.odrive.enums import AxisError, AxisState

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from echelon.bridge.protocols.faults import LATCHING, Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import LATCHING, Fault
 from echelon.bridge.protocols.odrive.drive import ODriveDrive
 from echelon.bridge.protocols.odrive.enums import AxisState
 from echelon.bridge.protocols.odrive.host import ODriveHost

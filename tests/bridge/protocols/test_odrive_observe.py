@@ -9,8 +9,8 @@ import cantools.database
 import pytest
 from cantools.database.can import Database
 
+from echelon.bridge.protocols.faults import LATCHING, Fault
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.protocols.motor import LATCHING, Fault
 from echelon.bridge.protocols.observe import Finding
 from echelon.bridge.protocols.odrive.config import ODriveConfig
 from echelon.bridge.protocols.odrive.dbc import messages

@@ -106,7 +106,7 @@ def test_small_socket_buffers(most: int, state: str, tmp_path: Path) -> None:
     (tmp_path / "rmem_default").write_text("212992\n")
     result = doctor.check_buffers(tmp_path)
     assert result.state == state
-    assert f"{most // 1024} KiB, candump has 208 KiB" in result.text
+    assert f"{most // 1024} KiB for receiving; candump uses 208 KiB" in result.text
     assert doctor.check_buffers(tmp_path / "nowhere").state == "note"
 
 
@@ -166,4 +166,4 @@ def test_whether_a_period_is_realistic() -> None:
     assert (slow.state, len(slow.advice)) == ("note", 1)
     assert "--clock virtual" in slow.advice[0]
     jittery = doctor.check_wall_clock(plan, Measured(0.02, 0.00003))
-    assert jittery.advice == ("woken up to 20 ms late: periods over 40 ms",)
+    assert jittery.advice == ("processes wake up to 20 ms late: use periods over 40 ms",)

@@ -139,12 +139,12 @@ def test_one_seed_is_one_run_and_another_is_not():
     first, again, other = (run([*lossy, f"seed={seed}"]).digest() for seed in (1, 1, 2))
     assert first == again != other
     free = [run(["duration=0.05", f"seed={seed}"]).digest() for seed in (1, 2)]
-    assert free[0] == free[1]  # nothing is drawn where nothing is lost or late
+    assert free[0] == free[1]  # links without loss and random delay draw no random numbers
     assert run(["duration=0.05", "law.lead=0.25"]).digest() != free[0]
 
 
 def intra_peaks(trace: Trace) -> Array:
-    """Returns the largest intra error of each 50 ms [m]; NaN where a robot was lost."""
+    """Returns the largest intra error of each 50 ms [m]; NaN where a state is not finite."""
     blocks = block_series(trace)
     norm = np.sqrt(sum(series.norm**2 for series in blocks.series if series.block.layer == "intra"))
     return norm[: len(norm) // 50 * 50].reshape(-1, 50).max(axis=1)

@@ -1,4 +1,4 @@
-"""What `validate` warns of, each against what a run does, or against numbers known another way."""
+"""Warnings of `echelon validate`, compared with what runs do, or with numbers that are computed in another way."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def test_a_run_that_is_too_short_for_health_checks() -> None:
     assert said == "duration = 17.9: too short to tell growth of centroid; 18 s is enough"
     checks = summarise(trace_of(plan_of("lab", "duration=17.9", "claims=[]")), [], None, run_facts()).verdict.checks
     growth = [check for check in checks if check.name == "growth" and check.outcome == "not tested"]
-    assert [check.about for check in growth] == [("centroid",)]  # and so it is
+    assert [check.about for check in growth] == [("centroid",)]  # the run has the same result
     assert warnings(plan_of("lab", "duration=18.0", "claims=[]")) == ()
 
 
@@ -92,7 +92,7 @@ def test_on_the_closed_path_commands_are_used_at_torque_periods() -> None:
 
 
 def replace_delay(plan: Plan, delay_ns: int) -> Plan:
-    """Returns a plan with another delay on its links that have one."""
+    """Returns a plan in which all links with a delay have another one."""
     links = (
         replace(link, delay_min_ns=delay_ns, delay_max_ns=delay_ns) if link.delay_max_ns else link
         for link in plan.links
@@ -115,7 +115,7 @@ def test_a_loop_that_does_not_settle_with_its_links() -> None:
 
 
 def test_more_torque_than_a_robot_has() -> None:
-    """The start's torques are those of the first act of the run itself."""
+    """The torques at the start that the warnings are about are those of the run's first period."""
     free = plan_of("lab", "duration=0.01", "claims=[]", *FREE)
     peaks = start_torques(free)
     limit = float(np.sort(peaks)[-3]) * (1 + 1e-9)
@@ -127,7 +127,7 @@ def test_more_torque_than_a_robot_has() -> None:
 
 
 def start_torques(plan: Plan) -> np.ndarray:
-    """Returns the larger torque of each robot's wheels in the first torque period, as the roles of a run have it."""
+    """Returns the larger torque of each robot's wheels in the first torque period of a run."""
     said: list[Message] = []
     plan = replace(plan, duration_ns=plan.root.period_ns)
     Engine(plan, said.append).run()
@@ -146,7 +146,7 @@ def test_more_speed_than_a_wheel_has() -> None:
 
 @pytest.mark.parametrize(("q", "dies"), [(0.5, True), (1.9, True), (2.1, False)])
 def test_the_torque_loop_dies_away_up_to_its_edge(q: float, dies: bool) -> None:
-    """A robot that rolls at v, turned a little: with no acceleration wanted, its own loop and plant for 200 torque periods."""
+    """Simulates torque loop and plant of a slightly turned robot that moves at v, with zero acceleration, for 60 periods."""
     plan = plan_of("lab", *FREE)
     robot = make_robot(plan, 0)
     h, d = plan.robots[0].torque_period_ns * 1e-9, plan.robots[0].offset

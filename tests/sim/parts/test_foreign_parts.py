@@ -127,7 +127,7 @@ def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
     )
     assert (says if isinstance(says, str) else says[kind]) in text
     assert len(text.splitlines()) == 1
-    parse((folder / "mine.toml").read_text(), "mine.toml", [use], folder, trial=False)  # as the result of a run is read
+    parse((folder / "mine.toml").read_text(), "mine.toml", [use], folder, trial=False)  # as for a run's folder
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,7 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     summary = summary_of(folder / "run")
     assert summary["instants"] > 5
     (reason,) = (reason for reason in reasons(summary) if reason.startswith("stalled"))
-    assert reason == said.removeprefix("echelon: ")  # which says once when it was
+    assert reason == said.removeprefix("echelon: ")  # the text says only once at which time it was
     if "processes" in way:
         assert f" at t = {summary['simulated']:g} s: " in said
     if "closed" in way:

@@ -75,6 +75,17 @@ def test_in_any_order_of_start(tmp_path: Path, backwards: bool) -> None:
     assert outcome.trace.digest() == DIGEST_OF_ONE_PROCESS()
 
 
+def test_drives_may_be_brought_up_for_longer_than_members_may_be_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("echelon.sim.processes.supervisor.WALL_OVERTIME_S", 5.0)
+    plan = plan_of("lab", "can.path=closed", "duration=0.2", "can.bring_up=7.0")
+    outcome = Supervisor(
+        plan, tmp_path, run=f"test-{os.getpid()}", virtual=False, can_urls=(resolve_url("auto"),)
+    ).run()
+    assert outcome.failure is None
+
+
 def DIGEST_OF_ONE_PROCESS() -> str:  # noqa: N802
     from support.runs import trace_of
 

@@ -15,7 +15,9 @@ import pytest
 from echelon.plan.plan import Plan
 from echelon.sim.parts.loading import parse
 from echelon.sim.processes.contract import ProcessSpec
-from echelon.sim.processes.supervisor import NAMED, Outcome, Progress, Supervisor, few
+from echelon.sim.processes.failures import NAMED, few
+from echelon.sim.processes.outcome import Outcome, Progress
+from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.recording.mcap_reader import read_trace, recover
 from support.runs import (
     descendants,
@@ -189,7 +191,7 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
 def test_a_process_that_stands_still_for_a_while_costs_only_time(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("echelon.sim.processes.supervisor.STALL_REPORT_S", 2.2)
+    monkeypatch.setattr("echelon.sim.processes.stalls.STALL_REPORT_S", 2.2)
     plan, notes = plan_of("paper", "duration=3", LINKS), []
     stopped: list[int] = []
 

@@ -74,7 +74,7 @@ def test_what_is_no_message_is_counted_and_the_rest_is_kept() -> None:
     received = reception(Inbox([b"\x01", join([b"\x01\x00"]), good[0][:-1], stranger, odd, *good[1:]]))
     out = [each for portion in received.drain(None) for each in portion]
     missing = set(keys(messages)) - set(keys(out))
-    assert missing == set(keys([each for each in messages if each.source == 0]))  # a batch goes whole or not at all
+    assert missing == set(keys([each for each in messages if each.source == 0]))  # a batch is refused as a whole
     assert received.refused == {
         "batch cut in a length": 1,
         "too short": 1,
@@ -92,7 +92,7 @@ def test_drain_ends_with_what_is_expected_or_in_silence(monkeypatch: pytest.Monk
     inbox = Inbox(*parts, [b"not asked for"])
     assert len([m for portion in reception(inbox).drain(len(messages)) for m in portion]) == len(messages)
     assert inbox.portions == [[b"not asked for"]]
-    silent = Inbox(*parts[:3], [], *parts[3:])  # a broken run: after silence nothing is waited for
+    silent = Inbox(*parts[:3], [], *parts[3:])  # a run that broke off: after a silence watchers wait no longer
     out = [m for portion in reception(silent).drain(None) for m in portion]
     assert {m.source for m in out} == {0, 1, 2}
     monkeypatch.setattr(watchers, "DRAIN_S", 0.05)  # the wait for missing messages ends
@@ -136,7 +136,7 @@ def test_a_recording_ends_with_the_instant_at_which_a_state_is_not_finite(
     recording.add(messages)
     recording.close([])
     result = recording.report()
-    if keep_going or value == 1e200:  # its square is not finite, but it is
+    if keep_going or value == 1e200:  # 1e200 is finite, though its square is not
         assert (result.lost, result.stopped(paper())) == (None, None)
         assert result.messages == len(messages)
     else:

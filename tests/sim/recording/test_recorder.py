@@ -89,8 +89,9 @@ def test_every_message_is_there_with_its_values(recorded: tuple[Path, list[Messa
     path, messages = recorded
     expected: dict[str, list[tuple[int, list[float]]]] = {}
     for message in messages:
-        if not message.is_null:
-            expected.setdefault(topic_of(message), []).append((message.time_ns, message.values.tolist()))
+        null = [float(message.source), float(message.channel), float(message.sequence)]
+        topic, values = ("/nulls", null) if message.is_null else (topic_of(message), message.values.tolist())
+        expected.setdefault(topic, []).append((message.time_ns, values))
     found: dict[str, list[tuple[int, list[float]]]] = {}
     with decoded(path) as rows:
         for topic, time_ns, message in rows:
@@ -99,7 +100,7 @@ def test_every_message_is_there_with_its_values(recorded: tuple[Path, list[Messa
                 assert stamp.sec * 10**9 + stamp.nanosec == time_ns
                 found.setdefault(topic, []).append((time_ns, values_of(message)))
     assert found == expected
-    assert len(found) == 9 + 3 + 3 + 1
+    assert len(found) == 9 + 3 + 3 + 1 + 1
 
 
 def test_times_sequences_and_statistics_by_the_mcap_reader(recorded: tuple[Path, list[Message]]) -> None:

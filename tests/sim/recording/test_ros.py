@@ -12,23 +12,24 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from echelon.messages import STATE_FIELDS, Channel
 from echelon.runtime.link import LinkCounts
 from echelon.sim.recording import ros
+from echelon.sim.recording.ros_definitions import DEFINITIONS, schema_name, schema_text
 
 
 def make_typestore() -> Any:
     """Returns a rosbags typestore that knows our schema texts and nothing else."""
     store = get_typestore(Stores.EMPTY)
-    for name in ros.DEFINITIONS:
-        store.register(get_types_from_msg(ros.schema_text(name), ros.schema_name(name)))
+    for name in DEFINITIONS:
+        store.register(get_types_from_msg(schema_text(name), schema_name(name)))
     return store
 
 
 STORE = make_typestore()
-FULL_NAMES = sorted(ros.schema_name(name) for name in ros.DEFINITIONS)
+FULL_NAMES = sorted(schema_name(name) for name in DEFINITIONS)
 
 
 def make(name: str, *values: Any) -> Any:
     """Returns a rosbags message of a type, its fields in order."""
-    return STORE.types[ros.schema_name(name)](*values)
+    return STORE.types[schema_name(name)](*values)
 
 
 def header(time_ns: int, frame_id: str) -> Any:
@@ -38,7 +39,7 @@ def header(time_ns: int, frame_id: str) -> Any:
 
 def serialized(name: str, message: Any) -> bytes:
     """Returns a message as bytes, as rosbags serializes it."""
-    return bytes(STORE.serialize_cdr(message, ros.schema_name(name)))
+    return bytes(STORE.serialize_cdr(message, schema_name(name)))
 
 
 times = st.integers(0, 2**31 * 10**9 - 1)
@@ -86,11 +87,21 @@ GOLDEN = [
 def test_golden_bytes_both_ways(name: str, splice: ros.Splice, values: Any, golden: bytes) -> None:
     assert splice.size == values.nbytes
     assert splice.encode(ros.stamp(7_123_456_789), values.tobytes()) == golden
+    assert splice.decode(golden) == values.tobytes()
     message = STORE.deserialize_cdr(golden, f"echelon_msgs/msg/{name}")
     fields = [field for field in message.__dataclass_fields__ if field not in ("header", "__msgtype__")]
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (7, 123456789)
     assert message.header.frame_id == "world"
     assert np.array_equal(np.concatenate([np.atleast_1d(getattr(message, field)) for field in fields]), values)
+
+
+def test_bytes_of_another_size_or_with_other_arrays_are_refused() -> None:
+    splice, (_, _, _, golden) = ros.group_state(2, 1), GOLDEN[1]
+    for odd in (golden[:-1], golden + b"\0", b""):
+        with pytest.raises(ValueError, match=rf"has {len(odd)} bytes, not {len(golden)}"):
+            splice.decode(odd)
+    with pytest.raises(ValueError, match="has an array of another length"):
+        ros.group_state(1, 2).decode(golden)
 
 
 def test_golden_can_frame() -> None:
@@ -139,7 +150,9 @@ def test_group_state(time_ns: int, centroid: Any, rates: Any, positions: Any) ->
     message = make("echelon_msgs/GroupState", header(time_ns, "world"), *centroid.tolist(), rates, positions)
     values = np.concatenate([centroid, rates, positions])
     splice = ros.group_state(len(rates), len(positions))
-    assert splice.encode(ros.stamp(time_ns), values.tobytes()) == serialized("echelon_msgs/GroupState", message)
+    encoded = splice.encode(ros.stamp(time_ns), values.tobytes())
+    assert encoded == serialized("echelon_msgs/GroupState", message)
+    assert splice.decode(encoded) == values.tobytes()
 
 
 @given(times, arrays(st.integers(1, 3)), arrays(st.integers(0, 3)), arrays(st.integers(0, 3)))
@@ -148,6 +161,7 @@ def test_reference_and_command(time_ns: int, accelerations: Any, rates: Any, for
     message = make("echelon_msgs/Reference", header(time_ns, "world"), accelerations, rates, forces)
     splice = ros.reference(len(accelerations), len(rates), len(forces))
     assert splice.encode(head, values) == serialized("echelon_msgs/Reference", message)
+    assert splice.decode(splice.encode(head, values)) == values
     message = make("echelon_msgs/Command", header(time_ns, "world"), accelerations)
     encoded = ros.command(len(accelerations)).encode(head, accelerations.tobytes())
     assert encoded == serialized("echelon_msgs/Command", message)
@@ -197,6 +211,13 @@ def test_joint_state(time_ns: int, joints: list[str], data: st.DataObject) -> No
     message = make("sensor_msgs/JointState", header(time_ns, ""), joints, np.empty(0), velocity, effort)
     encoded = ros.joint_state(joints).encode(time_ns, np.concatenate([velocity, effort]))
     assert encoded == serialized("sensor_msgs/JointState", message)
+
+
+@given(times, st.integers(0, 2**32 - 1), st.integers(0, 255), st.integers(0, 2**64 - 1))
+def test_null_message(time_ns: int, source: int, channel: int, sequence: int) -> None:
+    message = make("echelon_msgs/NullMessage", header(time_ns, ""), source, channel, sequence)
+    encoded = ros.null_message(ros.stamp(time_ns), source, channel, sequence)
+    assert encoded == serialized("echelon_msgs/NullMessage", message)
 
 
 singles = st.floats(0, 1, width=32)

@@ -11,7 +11,7 @@ from support.synthetic import decaying, link_counts, run_facts
 
 CHANGES = {
     "law.lead": "0.25",
-    "links[0].delay": "0.02",
+    "links.0.delay": "0.02",
     "formation.groups.g1.robots.r1.start": "[0.0, -1.5]",
     "description": '"a \\"b\\""',
 }
@@ -49,4 +49,4 @@ def test_how_runs_were_made_differs_too(summary) -> None:
 
 def test_a_key_that_only_one_has_is_a_dash_in_the_other(summary) -> None:
     rows = differences([effective(LINK), effective()], [summary] * 2)
-    assert ["links[0].delay", "0.01", "–"] in rows
+    assert ["links.0.delay", "0.01", "–"] in rows

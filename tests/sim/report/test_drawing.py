@@ -1,4 +1,4 @@
-"""How figures look: time where the action is, words beside curves, a second cue beside colour."""
+"""How figures look: their time axes, words beside curves, and dashes and marks besides colours."""
 
 import warnings
 from dataclasses import replace
@@ -12,9 +12,11 @@ from matplotlib.figure import Figure
 from echelon.bridge.protocols.registry import protocol_of
 from echelon.cli.new_scenario import scenario_text, sizes
 from echelon.sim.parts.loading import parse
+from echelon.sim.report.axes import PEAKS, TAUS, TorqueScale, distance_time, torque_time
 from echelon.sim.report.comparison import WIDTH, Compared, comparison, longest
-from echelon.sim.report.drawing import GROUPS, RUNS, Look, TimeAxis
-from echelon.sim.report.figures import FIGURES, PEAKS, TAUS, TorqueScale, distance_time, errors, picture, torque_time
+from echelon.sim.report.drawing import GROUPS, RUNS, Look
+from echelon.sim.report.figures import FIGURES, errors, picture
+from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.report.torque_steps import steps_text
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.distances import distances
@@ -73,7 +75,7 @@ SCENARIOS = {groups: scenario_text("my", sizes(groups), None) for groups in ("1x
 
 @pytest.mark.parametrize("text", [*SCENARIOS.values(), readme_scenario()], ids=[*SCENARIOS, "README"])
 def test_no_figure_of_a_first_run_gives_a_warning(text: str) -> None:
-    """Whatever is drawn outside of the axes leaves no room for them."""
+    """matplotlib warns if what is drawn outside the axes leaves no room for the axes."""
     trace = trace_of(parse(text, "my.toml")[1])
     blocks, near = block_series(trace), distances(trace)
     alone = [picture(name, trace, blocks, width) for name in FIGURES for width in (WIDTH, WIDTH / 2)]

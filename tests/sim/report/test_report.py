@@ -21,10 +21,11 @@ from echelon.bridge.reports import (
 )
 from echelon.planning.loading import effective_toml
 from echelon.sim.report.drawing import COLUMNS, thin
-from echelon.sim.report.report import RunForReport, write_report
-from echelon.sim.results.records import count
+from echelon.sim.report.report import write_report
+from echelon.sim.report.run_for_report import RunForReport
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
+from echelon.sim.results.verdict import count
 from support.synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
 
 FIGURES, COMPARED = 5, 4
@@ -139,7 +140,7 @@ def test_the_caption_of_distances_says_what_the_table_below_says(radius, tmp_pat
     text = rendered([one], tmp_path / "report.html").text
     said = {
         True: f"not enabled: {count(len(pairs), 'pair')} came closer than 6 m.",
-        False: "robots keep out of it by chance.",
+        False: "robots keep this distance by chance.",
     }
     assert [words in text for words in said.values()] == [bool(pairs), not pairs]
 
@@ -167,7 +168,9 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
         buses=(BusReport("can0", 500_000, 0.25, events=events, identifiers=identifiers),),
         robots={"g1/r1": WheelsReport("odrive", 5, {"rise limit": 3}, 1.5, enabled=False, fault="right: hot")},
         drives=DrivesReport({"g1/r1": DriveReport({}, 0, 71.25)}, {}),
-        referee=RefereeReport(11, 0, {"gap": 1}, (FindingReport(1.5, "can0", "100", "gap", "<late>", "g1/r1"),), {}),
+        referee=RefereeReport(
+            11, 0, {"gap": 1}, (FindingReport(1.5, "can0", "100", "gap", "<late>", "g1/r1"),), {}, until=3.5, later=4
+        ),
     )
     one = for_report(run, "bus")
     text = rendered([replace(one, summary=replace(one.summary, can=can))], tmp_path / "report.html").text
@@ -175,7 +178,8 @@ def test_the_bus_its_drives_and_the_referee_are_on_the_page(run, tmp_path):
     assert "became zero before the bus: 3 times rise limit" in text
     assert "100 5 1 2 1 2 3 101 5 1 2 1 2 –" in text
     assert "g1/r1 odrive 5 1.5 0 0 0 0 False right: hot 3 rise limit 71.25" in text
-    assert "11 frames and found 1 gap" in text
+    assert "Frames up to 3.5 s, where the run was stopped: 11. Found: 1 gap." in text
+    assert "The run was stopped at 3.5 s; can.log and the numbers of the buses include 4 later frames" in text
     assert "1.5 can0 100 g1/r1 gap <late>" in text
     assert "2 scheduled g1/r1, g1/r2 estop, until 4 s 2.5 can0 g1/r1 bus-off" in text
 
@@ -207,8 +211,8 @@ def test_a_comparison_says_what_differs_and_takes_nothing_of_the_first_run_for_a
     assert "9 robots · 4 nodes · 3 s, 1 s · trace" in both.text
     (rows,) = re.findall("What differs .* key left right (.*?) Compared", both.text)
     assert rows == (
-        'duration 3.0 1.0 avoidance.enabled false true claims[1].block "centroid" "inter" claims[2].block – "centroid" '
-        "claims[2].settled_by – 10.0 claims[2].band – 0.05"
+        'duration 3.0 1.0 avoidance.enabled false true claims.1.block "centroid" "inter" claims.2.block – "centroid" '
+        "claims.2.settled_by – 10.0 claims.2.band – 0.05"
     )
 
 
@@ -265,6 +269,14 @@ def test_runs_that_went_wrong_are_drawn_as_far_as_they_go(run, tmp_path):
     page = rendered(shown, tmp_path / "report.html")
     assert page.tags.count("svg") == 4 * FIGURES + COMPARED
     assert page.text.count("FAILS —") == 4
+
+
+def test_a_link_over_which_nothing_was_used_has_no_ages(run, tmp_path):
+    one = for_report(run, "run")
+    unused = replace(one.summary.links[0], used=0, age_mean=None, age_max=None)
+    page = rendered([replace(one, summary=replace(one.summary, links=(unused,)))], tmp_path / "report.html")
+    counts = f"{unused.sent} {unused.lost} {unused.in_flight} {unused.held}"
+    assert f"{unused.source} → {unused.receiver} {unused.channel} {counts} – –" in page.text
 
 
 def test_a_report_needs_a_run(tmp_path):

@@ -1,4 +1,4 @@
-"""Every check that a run is put to, passed and failed, not tested and switched off."""
+"""Every check of a run: passed, failed, not tested, and switched off."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,9 +12,10 @@ from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.scenario.tables import CheckName
 from echelon.sim.results.checks import CHECKS
-from echelon.sim.results.records import CheckResult, Summary
+from echelon.sim.results.records import Summary
 from echelon.sim.results.summary import summarise, summary_text
 from echelon.sim.results.trace import Trace
+from echelon.sim.results.verdict import CheckResult
 from support.runs import plan_of
 from support.synthetic import FIELD, can_report, of_errors, run_facts, with_states
 
@@ -28,7 +29,7 @@ WHEELS = WheelsReport("native", 100, {}, 0.1, came_up=-0.5, enabled=True)
 
 
 def decaying(scale: float = 0.1, *overrides: str, grow: float = 0.0) -> Trace:
-    """A run of the lab scenario: errors fall by e in half a second, and `grow` comes in at 1.2 s for each e."""
+    """A run of the lab scenario of 20 s with errors scale e^(-t/0.5 s) + grow e^((t - 20 s)/1.2 s) [m]."""
     plan = plan_of("lab", "claims=[]", "duration=20.0", *overrides)
 
     def motion(block, seconds):
@@ -40,7 +41,7 @@ def decaying(scale: float = 0.1, *overrides: str, grow: float = 0.0) -> Trace:
 
 
 def counted(plan: Plan, **given: Any) -> list[LinkCounts]:
-    """Counts of all links of a plan; those of the first are as given."""
+    """Returns counts of all links of a plan; the first link has the given counts."""
     every = [LinkCounts(link.source, link.receiver, link.channel, 10, 10, 0, 0, 10, 0, 0.0, 0) for link in plan.links]
     return [replace(every[0], **given), *every[1:]]
 
@@ -62,7 +63,7 @@ def states(trace: Trace, field: str, value: float, robot: int = 0, rows: slice =
 
 
 def without(trace: Trace, robot: int, rows: slice) -> Trace:
-    """The trace without some instants of a robot."""
+    """Returns the trace without some instants of a robot."""
     keep = np.ones(len(trace.times_ns[robot]), dtype=bool)
     keep[rows] = False
     times, values = list(trace.times_ns), list(trace.states)
@@ -116,7 +117,7 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
         "not tested": (lambda: judged(decaying(0.1, "duration=2.0")), "a third of the run is shorter than the dwell time"),
     },
     "end": {
-        "passed": (lambda: judged(decaying()), "no block ends above where it began"),
+        "passed": (lambda: judged(decaying()), "no block ends with a larger error than at the start"),
         "not tested": (lambda: judged(decaying(0.1, "duration=2.0")), "a third of the run is shorter than the dwell time"),
     },
     "distance": {
@@ -126,7 +127,7 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
     "avoidance": {
         "passed": (lambda: judged(met(0.5, "avoidance.enabled=true")), "no two robots came closer than 0."),
         "failed": (lambda: judged(met(0.1, "avoidance.enabled=true")), "g1/r1 and g1/r2 came to 0.1 m"),
-        "not tested": (lambda: judged(decaying(0.1)), "nobody came within"),
+        "not tested": (lambda: judged(decaying(0.1)), "no two robots came within"),
     },
     "saturation": {
         "passed": (lambda: judged(states(decaying(0.1, LIMIT), "saturated", 1.0, 0, slice(1, 301))), "for 15 % of the time"),
@@ -137,16 +138,16 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
         ),
     },
     "messages": {
-        "passed": (lambda: judged(decaying()), "something came and was used"),
+        "passed": (lambda: judged(decaying()), "messages were used on each of"),
         "failed": (
             lambda: judged(t := decaying(), links=counted(t.plan, delivered=0, lost=10, **UNUSED)),
-            "nothing ever arrived over 1 of",
+            "no message arrived on 1 of",
         ),
-        "not tested": (lambda: judged(decaying(), links=[]), "nobody counted the messages"),
+        "not tested": (lambda: judged(decaying(), links=[]), "the messages of the links were not counted"),
     },
     "silence": {
-        "passed": (lambda: judged(without(decaying(0.1, NO_RECORDING), 3, slice(100, 149))), "g2/r4 said nothing for 0.5 s"),
-        "failed": (lambda: judged(without(decaying(), 3, slice(100, 150))), "g2/r4 said nothing for 0.51 s"),
+        "passed": (lambda: judged(without(decaying(0.1, NO_RECORDING), 3, slice(100, 149))), "g2/r4 sent no state for 0.5 s"),
+        "failed": (lambda: judged(without(decaying(), 3, slice(100, 150))), "g2/r4 sent no state for 0.51 s"),
     },
     "refused": {
         "passed": (lambda: judged(decaying()), "no message was refused"),
@@ -218,7 +219,7 @@ def summary_plan(name: str) -> Plan:
 
 
 def made(name: str) -> Trace:
-    """A trace to which a check applies."""
+    """Returns a trace to which a check applies."""
     overrides = {
         "distance": ("avoidance.enabled=false",),
         "drives": ("can.path=closed",),
@@ -228,7 +229,7 @@ def made(name: str) -> Trace:
 
 
 def again(summary: Summary, plan: Plan, name: str) -> Summary:
-    """The same facts about a run with another plan."""
+    """Returns the summary of a run with another plan and the same facts."""
     trace = made(name)
     return judged(Trace(plan, trace.times_ns, trace.states), can=summary.can, run=replace(summary.run, refused=0))
 
@@ -248,7 +249,7 @@ def test_what_is_missing_has_its_robot_its_time_and_on_a_busy_machine_the_likely
     for facts, cause in (({}, ""), (busy, "; 4.5 % of stages were late: was the machine busy?")):
         summary = judged(trace, run=run_facts(**facts))
         silent, lacking = only(summary, "silence").text, only(summary, "recording").text
-        assert silent == f"g2/r4 said nothing for 0.61 s from t = 0.99 s on, the longest of all robots{cause}"
+        assert silent == f"g2/r4 sent no state for 0.61 s from t = 0.99 s on, the longest of all robots{cause}"
         whose = "1 of g1/r2 after t = 4.99 s, 60 of g2/r4 after t = 0.99 s"
         assert lacking == f"the recording lacks 61 states ({whose}){cause}"
     assert "busy" not in only(judged(decaying(), run=run_facts(**busy)), "silence").text
@@ -264,7 +265,7 @@ def test_a_message_that_came_but_was_never_used_is_told_from_one_that_never_came
     trace = decaying()
     summary = judged(trace, links=counted(trace.plan, **UNUSED))
     assert only(summary, "messages").text.startswith(
-        "nothing that arrived was ever used, as too old or empty, over 1 of"
+        "messages arrived, but none was used, as too old or empty, on 1 of"
     )
     assert summary.links[0].age_mean is None
     assert summary.links[0].age_max is None
@@ -274,7 +275,7 @@ def test_where_nothing_was_ever_used_no_age_is_told():
     trace = decaying()
     none = [replace(one, delivered=0, lost=10, used=0) for one in counted(trace.plan)]
     assert "10 lost, oldest" not in (text := summary_text(judged(trace, links=none)))
-    assert "nothing was ever used" in text
+    assert "no message was used" in text
 
 
 @pytest.mark.parametrize(

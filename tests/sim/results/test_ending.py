@@ -50,7 +50,7 @@ def moving(*overrides):
 
 @pytest.mark.parametrize("delay", [0.02, 0.05])
 def test_a_delay_of_all_links_leaves_the_centroid_ahead_by_what_it_moves_in_two_of_them(delay):
-    """A robot's state is one delay old at its leader, and what the leader says of its group one more at the coordinator."""
+    """A robot's state is one delay old at its leader, and two delays old in the group's state at the coordinator."""
     _, blocks, ended = moving(f"links=[{{delay={delay}}}]")
     assert blocks.series[-1].norm[-1] == pytest.approx(SPEED * 2 * delay, abs=0.4 * np.exp(-0.5 * 20))  # σ 1 s
     assert ended["centroid"].kind == "steady lag"
@@ -59,7 +59,7 @@ def test_a_delay_of_all_links_leaves_the_centroid_ahead_by_what_it_moves_in_two_
 
 
 def test_a_robot_that_is_heard_of_late_stands_ahead_by_its_own_delay_and_every_block_that_it_is_part_of_says_so():
-    """What the law takes away is the error of what it knows: m_i = p_i - v τ_i = d_i, so p_i = d_i + v τ_i."""
+    """The law makes the positions that it knows equal to the desired ones, m_i = p_i - v τ_i = d_i, so p_i = d_i + v τ_i."""
     late = 0.1
     trace, blocks, ended = moving(f"links=[{{source='a/a1', channel='state', delay={late}}}]")
     ahead = np.zeros((len(trace.plan.robots), 2))
@@ -97,7 +97,8 @@ def test_runs_grow_where_the_analysis_of_the_sampled_loop_says_so_and_only_there
 
 
 def ended_as(error, duration=24.0, overrides=()):
-    """Returns how a block ended whose error is `error` (T,) times a fixed direction; those of the others are zero."""
+    """Returns the ending of a block whose error is `error` (T,) times a fixed direction; the errors of other blocks are
+    zero."""
     plan = plan_of("lab", "claims=[]", f"duration={duration}", *overrides)
 
     def motion(block, seconds):
@@ -163,8 +164,8 @@ def test_a_decay_with_a_ripple_falls(rate, phase):
 
 
 def test_growth_is_the_ratio_of_the_last_two_sixths():
-    """Of e^(ct) it is e^(cT/6)."""
-    # The last one has an instant more, of 400.
+    """For the error e^(ct) the ratio is e^(cT/6)."""
+    # The last sixth has one instant more than the others, of 400 in all.
     assert ended_as(lambda t: 0.01 * np.exp(0.2 * t)).growth == pytest.approx(np.exp(0.2 * 24 / 6), rel=1 / 400)
 
 
@@ -173,7 +174,7 @@ def test_a_run_of_three_dwell_times_is_long_enough_to_tell(duration, kind):
     ending = ended_as(lambda t: 0.5 * np.exp(-0.3 * t), duration)
     assert ending.kind == kind
     if kind == "too short":
-        assert ending.text == "cannot be judged, for a third of the run is shorter than 3 s, its dwell time"
+        assert ending.text == "cannot be judged: a third of the run is shorter than its dwell time, 3 s"
 
 
 def test_the_bound_of_growth_is_the_scenarios():
@@ -202,4 +203,4 @@ def test_a_small_error_may_move_to_another_value_and_tremble_but_not_grow_on():
     assert creeping.spared.endswith("and would be for another run of this length")
     growing = ended_as(lambda t: beginning(t) + 1e-4 * np.exp(0.2 * t))
     assert growing.kind == "grows"
-    assert growing.level < SMALL  # small, and on its way out of there
+    assert growing.level < SMALL  # still small, but it grows

@@ -17,11 +17,12 @@ def test_what_is_published_is_up_to_date() -> None:
     assert json.loads(PUBLISHED.read_text(encoding="utf-8")) == summary_schema(), "make docs"
 
 
-def test_every_record_is_described() -> None:
+def test_every_record_and_every_key_is_described() -> None:
     schema = summary_schema()
     for name, table in {**schema["$defs"], "Summary": schema}.items():
         assert table["description"], name
         assert table["properties"], name
+        assert not [key for key, value in table["properties"].items() if not value.get("description")], name
 
 
 @pytest.mark.slow

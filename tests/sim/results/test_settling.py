@@ -1,4 +1,4 @@
-"""Settling times and decay rates against closed forms: the free answer of ë = -k1/σ² e - k2/σ ė.
+"""Settling times and decay rates against closed forms: the free response of ë = -k1/σ² e - k2/σ ė.
 
 With α = k2/2σ and ω² = k1/σ² - α², from rest, e(t) = e0 e^(-αt) (cos ωt + α/ω sin ωt), ė(t) = -e0 k1/(σ² ω) e^(-αt) sin ωt.
 """
@@ -28,7 +28,7 @@ def modes(block):
 
 
 def free(block, seconds):
-    """The answer of a block from rest."""
+    """The free response of a block from rest: its error and the rate of the error, each (T, size)."""
     alpha, omega = modes(block)
     fall, unit = np.exp(-alpha * seconds), np.ones(block.size) / sqrt(block.size)
     error = E0 * fall * (np.cos(omega * seconds) + alpha / omega * np.sin(omega * seconds))
@@ -37,7 +37,8 @@ def free(block, seconds):
 
 
 def last_outside(block, fraction):
-    """Returns when |e| of that answer is outside a band for the last time [s]: on a grid finer than any period of a run."""
+    """Returns the last time [s] at which |e| of the free response is outside a band, on a grid finer than any period of a
+    run."""
     t = np.arange(0, 30 * block.sigma, 1e-4 * block.sigma)
     alpha, omega = modes(block)
     e = np.exp(-alpha * t) * (np.cos(omega * t) + alpha / omega * np.sin(omega * t))
@@ -126,7 +127,10 @@ def test_a_centroid_that_must_catch_up_starts_with_its_peak():
         v / omega * exp(-alpha * at) * sin(omega * at), rel=1e-4
     )
     shape = settle(plan, blocks.series[0], blocks.times_ns, 0.05)
-    assert (shape.band, shape.settled_ns) == (plan.health.floor, 0)  # it starts within what is not judged, and stays
+    assert (shape.band, shape.settled_ns) == (
+        plan.health.floor,
+        0,
+    )  # it starts with an error within the floor, and stays there
 
 
 @pytest.mark.parametrize(

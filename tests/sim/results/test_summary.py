@@ -152,7 +152,7 @@ def test_nothing_claimed_is_no_claim_that_holds():
     record = record_of(decaying([NO_CLAIMS]).trace)
     assert record.verdict.word == "HEALTHY"
     assert record.verdict.sentence.startswith("HEALTHY: nothing was claimed; ")
-    assert "not tested: messages: nobody counted" in str(record.verdict)
+    assert "not tested: messages: the messages of the links were not counted" in str(record.verdict)
 
 
 def passing(offset: float, speed: float, steps: int, period_ns: int = 100 * MS) -> Trace:
@@ -360,3 +360,13 @@ def test_what_was_on_schedule_and_who_went_bus_off_is_told():
     assert lines[0].startswith("CAN 7 frames, 4 lost, 2 destroyed and sent again")
     assert lines[1:3] == ["events 2 s estop", "bus-off bridge at 2.5 s"]
     assert finding_text(referee) == "1 finding(s) on the bus, the first at 2.5 s, can0 100 g1/r1 gap: late"
+
+
+@pytest.mark.parametrize(("until", "later"), [(None, 0), (0.5, 0), (0.5, 3)])
+def test_frames_after_the_stop_of_a_run_are_told_where_there_are_some(until, later):
+    referee = RefereeReport(4, 0, {}, (), {}, until=until, later=later)
+    *_, last = can_lines(can_report(frames=7, referee=referee))
+    up_to = "" if until is None else " up to 0.5 s, where the run was stopped"
+    told = "can.log and the numbers of the buses include 3 later frames, which are not judged"
+    judged = f"  referee  4 frames{up_to}: nothing wrong"
+    assert last == (f"  stop     the run was stopped at 0.5 s; {told}" if later else judged)

@@ -1,4 +1,4 @@
-"""A trace is what robots said, and its digest depends on that alone."""
+"""A trace holds the robots' states, and its digest depends on nothing else."""
 
 from __future__ import annotations
 

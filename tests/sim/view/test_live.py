@@ -11,7 +11,7 @@ from echelon.bridge.reports import BridgeProgress
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
-from echelon.sim.processes.supervisor import Progress
+from echelon.sim.processes.outcome import Progress
 from echelon.sim.view import live
 from echelon.sim.view.live import Display
 from support.runs import plan_of

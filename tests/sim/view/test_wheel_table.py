@@ -17,7 +17,7 @@ from echelon.bridge.protocols.native.codec import FaultCode, Feedback, NativeCod
 from echelon.bridge.referee.referee import Referee
 from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.cli import main
-from echelon.cli.listening import show_live
+from echelon.cli.showing import show_live
 from echelon.sim.view.wheel_table import HALF, CanTable, Rate, bar
 from support.live_robot import TORQUES, LiveRobot, one_robot
 from support.runs import echelon, plan_of, start_echelon, until
@@ -210,10 +210,13 @@ def test_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["can", "lab", "--can", "virtual:x"], "virtual:x: is inside the process that opened it"),
+        (["can", "lab", "--can", "virtual:x"], "virtual:x: is a bus inside one process, where nobody else can listen"),
         (["can", "lab", "--can", "socketcan:none0"], "there is no network interface none0 that is up"),
         (["can", "lab", "--can", "nonsense"], "'nonsense' is not known"),
-        (["can", "lab", "--can", "udp_multicast:,udp_multicast:"], "the scenario has 1 buses, can0"),
+        (
+            ["can", "lab", "--can", "udp_multicast:,udp_multicast:"],
+            "must have a URL for each bus of the scenario (can0), with",
+        ),
         (["referee", "lab", "--can", "udp_multicast:", "--tolerance", "-1"], "--tolerance -1: must be 0 s or more"),
         (["can", "none"], "none: no such file, and no shipped scenario"),
         (["can", "lab", "--can", "udp_multicast:", "--speed", "2"], "--speed: is for a run's folder"),
@@ -246,7 +249,7 @@ def test_a_bus_that_is_alive(protocol: str, tmp_path: Path, capsys: pytest.Captu
         assert robot.enabled.wait(20.0)
         assert main(["can", str(path), "--can", url, "--seconds", "2.2", "--json"]) == 0
         shots = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        # processes wait for their turn here
+        # a busy machine delays processes, hence the tolerance
         code = main(["referee", str(path), "--can", url, "--seconds", "1", "--json", "--tolerance", "2"])
         summary = json.loads(capsys.readouterr().out)
     assert len(shots) >= 2

@@ -1,0 +1,85 @@
+"""What the supervisor of a run tells others: its progress while it goes on, and its outcome at the end."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
+from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
+from echelon.sim.processes.to_supervisor import Done, RecorderProgress, RecorderReport
+from echelon.sim.results.trace import Array, Trace, TraceBuilder
+
+_Report = TypeVar("_Report")
+
+
+@dataclass(slots=True)
+class Progress:
+    """The present state of a run, for a display."""
+
+    phase: str = "starting"
+    """`starting`, `running`, `stopping` (it diverged) or `finishing`"""
+    time_ns: int = 0
+    """Run time of the last recorded message [ns]"""
+    states_ns: int = 0
+    states: Array | None = None
+    """The last states of the robots, at run time `states_ns`; None before the first"""
+    messages: int = 0
+    """Number of recorded messages"""
+    started_s: float = 0.0
+    """When the run began, on the monotonic clock [s]; 0 before that"""
+    bridge: BridgeProgress = field(default_factory=BridgeProgress)
+    drives: BridgeProgress = field(default_factory=BridgeProgress)
+    note: str = ""
+    """News for the user, for example which process everyone waits for"""
+
+    def hear(self, recorder: RecorderProgress) -> None:
+        """Takes over the progress of the recorder."""
+        self.time_ns, self.messages = recorder.time_ns, recorder.messages
+        self.states, self.states_ns = recorder.states, recorder.states_ns
+
+
+@dataclass(slots=True)
+class Outcome:
+    """The result of a run: the recorded trace, and counts."""
+
+    trace: Trace
+    links: list[LinkCounts]
+    processes: list[Done]
+    """The reports of the processes; empty for a run in one process"""
+    can: CanReport | None
+    startup_s: float
+    """From the start of the first process until all were ready [s]"""
+    wall_s: float
+    """From the start of the run to its end, by the monotonic clock [s]"""
+    messages: int
+    failure: str | None = None
+    """Why the run broke off; None if it did not"""
+    stopped: str | None = None
+    """Why the run was stopped before its end though nothing failed; None if it was not"""
+
+
+def outcome_of(plan: Plan, processes: list[Done], failure: str | None, startup_s: float, wall_s: float) -> Outcome:
+    """Returns the outcome of a run from the reports of its processes.
+
+    A run whose recorder gave no report has an empty trace."""
+    recorder = _report(RecorderReport, processes)
+    can, drives = _report(CanReport, processes), _report(DrivesReport, processes)
+    if can is not None:
+        can = replace(can if drives is None else can.with_drives(drives), referee=_report(RefereeReport, processes))
+    return Outcome(
+        trace=TraceBuilder(plan).build() if recorder is None else recorder.trace,
+        links=[counts for process in processes for counts in process.links],
+        processes=processes,
+        can=can,
+        startup_s=startup_s,
+        wall_s=wall_s,
+        messages=0 if recorder is None else recorder.messages,
+        failure=failure,
+        stopped=None if recorder is None else recorder.stopped(plan),
+    )
+
+
+def _report(kind: type[_Report], processes: Iterable[Done]) -> _Report | None:
+    """Returns the report of a kind among those of the processes; None if no process gave one."""
+    return next((process.report for process in processes if isinstance(process.report, kind)), None)

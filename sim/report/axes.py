@@ -1,0 +1,175 @@
+"""Axes that the figures of one run and of several runs share: small axes in rows, time, torque, distance, errors, maps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+
+from echelon.messages import STATE_FIELDS, field_index
+from echelon.plan.plan import Plan
+from echelon.sim.report.drawing import QUIET, drawable, short
+from echelon.sim.report.time_axis import TimeAxis
+from echelon.sim.results.block_series import Blocks
+from echelon.sim.results.distances import Distances
+from echelon.sim.results.trace import Trace
+
+Array = NDArray[np.float64]
+SMALL_MULTIPLES: Final = 16
+"""Robots that the figure of torques shows, at most"""
+CALM: Final = 0.02
+"""A figure ends when torques stay below this share of the largest, or the distance within this share of its last value"""
+CALM_TORQUE: Final = "no torque is more than 2 % of the largest"
+CALM_DISTANCE: Final = "it stays within 2 % of its last value"
+PEAKED: Final = 20.0
+"""The axis of torques is logarithmic if the largest torque is more than this multiple of the 95th percentile"""
+TAUS: Final = field_index(STATE_FIELDS, "tau_right", "tau_left")
+PEAKS: Final = field_index(STATE_FIELDS, "tau_right_peak", "tau_left_peak")
+
+
+def small_multiples(figure: Figure, count: int, columns: int, sharey: bool = True) -> NDArray[Any]:
+    """Returns `count` small axes in rows of `columns`, as an array (rows, columns); those beyond `count` are invisible."""
+    grid: NDArray[Any] = figure.subplots(-(-count // columns), columns, squeeze=False, sharex=True, sharey=sharey)
+    for axes in grid.flat[count:]:
+        axes.set_visible(False)
+    for axes in grid.flat[max(count - columns, 0) : count]:  # the lowest one of each column
+        axes.tick_params(labelbottom=True)
+    return grid
+
+
+def distance_time(near: Distances, plan: Plan) -> TimeAxis:
+    """Returns the time axis for distances.  It ends soon after the smallest distance stays within 2 % of its last value, but
+    not before the closest encounter."""
+    smallest, time = drawable(near.smallest), TimeAxis.of(plan, near.times_ns)
+    if not len(smallest) or not np.isfinite(smallest).all():
+        return time
+    closest_s = 0.0 if near.closest is None else near.closest.time_ns / 1e9
+    moves_s = _last_s(near.times_ns, np.abs(smallest - smallest[-1]) > CALM * abs(smallest[-1]))
+    return time.until(max(moves_s, closest_s))
+
+
+def torque_time(trace: Trace) -> TimeAxis:
+    """Returns the time axis for torques.  It ends soon after the last torque above 2 % of the largest."""
+    bound, time = CALM * TorqueScale.of([trace]).limit, TimeAxis.of(trace.plan, max(trace.times_ns, key=len))
+    with np.errstate(invalid="ignore"):
+        active = [np.any(~(np.abs(states[:, TAUS]) <= bound), axis=1) for states in trace.states]
+    return time.until(
+        max((_last_s(times_ns, row) for times_ns, row in zip(trace.times_ns, active, strict=True)), default=0.0)
+    )
+
+
+def _last_s(times_ns: NDArray[np.int64], active: ArrayLike) -> float:
+    """Returns the last of the instants at which `active` (T,) is true [s]; 0 if there is none."""
+    found = np.flatnonzero(active)
+    return float(times_ns[found[-1]]) / 1e9 if found.size else 0.0
+
+
+def largest_torques(trace: Trace) -> list[float]:
+    """Returns the largest torque of each robot within its periods [N m]; 0 if none is finite."""
+    with np.errstate(all="ignore"):
+        return [float(np.fmax.reduce(states[:, PEAKS], axis=None, initial=0.0)) for states in trace.states]
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueScale:
+    """The y axis of torques [N m] that several small axes share."""
+
+    limit: float
+    """Largest torque"""
+    linear: float | None
+    """Torques up to this are on a linear scale, larger ones on a logarithmic scale; None: the whole axis is linear"""
+
+    @classmethod
+    def of(cls, traces: Sequence[Trace]) -> Self:
+        """Returns the axis for some runs: logarithmic if their peaks are much larger than most of their torques (`PEAKED`)."""
+        largest = [torque for trace in traces for torque in largest_torques(trace) if np.isfinite(torque)]
+        limit = min(max([*largest, 1e-3]), 1e12)
+        taus = np.abs(np.concatenate([states[:, TAUS].ravel() for trace in traces for states in trace.states]))
+        taus = taus[np.isfinite(taus) & (taus > 0)]
+        if limit < PEAKED * (float(np.quantile(taus, 0.95)) if taus.size else limit):
+            return cls(limit, None)
+        return cls(limit, 10.0 ** (np.floor(np.log10(limit)) - 3))
+
+    def apply(self, axes: Axes) -> None:
+        """Sets the y axis of axes."""
+        axes.set_ylim(-1.6 * self.limit, 1.6 * self.limit)
+        if self.linear is None:
+            axes.set_ylim(-1.1 * self.limit, 1.1 * self.limit)
+            axes.yaxis.set_major_locator(MaxNLocator(5))
+            return
+        axes.set_yscale("symlog", linthresh=self.linear, linscale=0.5)
+        axes.set_ylim(-1.6 * self.limit, 1.6 * self.limit)
+        ticks = [sign * self.linear * 10.0**power for power in (1, 3) for sign in (-1, 1)]
+        axes.set_yticks([*ticks, 0.0], labels=[short(tick) for tick in [*ticks, 0.0]])
+
+    @property
+    def words(self) -> str:
+        """The sentence about the axis in a caption; empty if it is linear."""
+        return "" if self.linear is None else "Torque is logarithmic beyond the innermost marks."
+
+
+def radii(axes: Axes, radius: float, sensing: float) -> None:
+    """Draws the avoidance radius and the sensing radius [m] as lines, on a logarithmic axis of distances."""
+    axes.set_yscale("log")
+    axes.axhspan(1e-12, radius, color="#d0342c", alpha=0.10, lw=0, zorder=0)
+    for value, text, colour in (
+        (radius, f"rₐ = {radius:g} m", "#d0342c"),
+        (sensing, f"Rₛ = {sensing:g} m", QUIET),
+    ):
+        axes.axhline(value, color=colour, lw=0.9, dashes=(3, 2), zorder=2)
+        axes.annotate(
+            text, (1, value), xycoords=("axes fraction", "data"), xytext=(3, 0), textcoords="offset points",
+            ha="left", va="center", fontsize=7.5, color=colour, annotation_clip=False,
+        )  # fmt: skip
+
+
+def distance_limits(axes: Axes, shown: Array, radius: float, sensing: float) -> None:
+    """Sets the limits and the label of an axis of distances so that both radii and all distances `shown` [m] are in it."""
+    finite = shown[np.isfinite(shown)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (radius, sensing)
+    axes.set_ylim(min(low, radius) / 1.6, max(high, sensing) * 1.6)
+    axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.set_ylabel("smallest distance [m]")
+
+
+def positive(norm: Array) -> Array:
+    """Returns |e| for a logarithmic axis: NaN where it is zero."""
+    return np.where(norm > 0, norm, np.nan)
+
+
+def as_map(axes: Axes) -> None:
+    """Gives x and y [m] the same scale."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+
+
+def extent(place: Array) -> float:
+    """Returns the largest extent of positions (…, …, 2) in x or in y [m]; 1 if there is none."""
+    with np.errstate(all="ignore"):
+        span = np.fmax.reduce(place, axis=(0, 1)) - np.fmin.reduce(place, axis=(0, 1))
+    largest = float(np.fmax.reduce(span))
+    return largest if np.isfinite(largest) and largest > 0 else 1.0
+
+
+def map_height(place: Array, width: float) -> float:
+    """Returns the height of a map [inches] with positions (…, …, 2) and a given width: in proportion, within limits."""
+    with np.errstate(all="ignore"):
+        x, y = np.fmax.reduce(place, axis=(0, 1)) - np.fmin.reduce(place, axis=(0, 1)) if len(place) else (1.0, 1.0)
+        ratio = float(y / x)
+    return float(min(max(width * ratio if np.isfinite(ratio) else width, 0.6 * width), 1.3 * width, 7.4))
+
+
+def error_limits(axes: Axes, several: Sequence[Blocks]) -> None:
+    """Limits an axis of errors to six decades below the largest: near its zero crossings |e| is arbitrarily small, and that
+    says nothing."""
+    norms = [drawable(series.norm) for blocks in several for series in blocks.series]
+    largest = max((float(np.fmax.reduce(norm, initial=0.0)) for norm in norms), default=0.0)
+    if largest > 0:
+        axes.set_ylim(largest * 1e-6, largest * 2)

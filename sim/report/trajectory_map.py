@@ -1,0 +1,92 @@
+"""The map of a run: the robots' paths, the final formation, and the path of the centroid."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from echelon.messages import STATE_FIELDS, field_index
+from echelon.plan.plan import Plan
+from echelon.sim.report.axes import Array, as_map, extent, map_height
+from echelon.sim.report.drawing import CENTROID, Look, Picture, drawable
+from echelon.sim.results.desired import Desired
+from echelon.sim.results.trace import Trace
+
+X, Y, THETA = field_index(STATE_FIELDS, "x", "y", "theta")
+
+
+def trajectories(trace: Trace, width: float) -> Picture:
+    """Draws a map like the paper's Figs. 2 and 3: the paths of all robots, triangles that point in heading direction at their
+    start and end, the outline of each group at the end, and the desired and the real path of the centroid."""
+    times_ns, states = trace.common()
+    plan, place = trace.plan, drawable(states[:, :, [X, Y]])
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        if len(times_ns):
+            wanted = Desired(plan).sample(np.linspace(0, times_ns[-1] / 1e9, 400))[:, 0]
+            axes.plot(*wanted.T, color="#8d8d97", lw=1.6, dashes=(4, 2.5), zorder=2)
+            _label(axes, wanted[-1], "desired centroid", "#70707a", (6, -2))
+            axes.plot(*place.mean(axis=1).T, color=CENTROID, lw=0.9, zorder=3)
+            size = extent(place) / 62
+            for robot in plan.robots:
+                look = Look.of_robot(plan, robot)
+                path = place[:, robot.index]
+                axes.plot(*path.T, color=look.colour, ls=look.dashes, lw=0.9, alpha=0.85, zorder=4)
+                for at, filled in ((0, False), (-1, True)):
+                    _robot(axes, path[at], states[at, robot.index, THETA], size, look.colour, filled)
+            for number, (name, robots) in enumerate(_groups(plan)):
+                corners = place[-1, robots]
+                if np.isfinite(corners).all():
+                    look = Look.of_group(number)
+                    fill = {"fc": look.colour, "ec": look.colour, "ls": look.dashes}
+                    axes.add_patch(Polygon(_hull(corners), closed=True, alpha=0.13, lw=0.8, **fill))
+                    _label(axes, corners.mean(axis=0), name, look.colour, (0, -3), ha="center", weight="bold")
+        as_map(axes)
+
+    return Picture(width, map_height(place, width), draw)
+
+
+def _robot(axes: Axes, place: Array, heading: float, size: float, colour: str, filled: bool) -> None:
+    """Draws a robot at a place (2,) [m] as a triangle that points in the direction of its heading [rad]."""
+    if not np.isfinite([*place, heading]).all():
+        return
+    c, s = np.cos(heading), np.sin(heading)
+    corners = size * np.array([[1.0, 0.0], [-0.7, 0.62], [-0.7, -0.62]]) @ np.array([[c, s], [-s, c]]) + place
+    axes.add_patch(
+        Polygon(corners, closed=True, fc=colour if filled else "white", ec=colour, lw=1.0, zorder=6 + filled)
+    )
+
+
+def _groups(plan: Plan) -> list[tuple[str, list[int]]]:
+    """Returns name and robots (indices) of every group right below the root; of the whole formation if it has no groups."""
+    nodes = [node for node in plan.nodes if node.parent == plan.root.index] or [plan.root]
+    return [(node.name, list(range(node.first_robot, node.first_robot + node.robots))) for node in nodes]
+
+
+def _hull(points: Array) -> Array:
+    """Returns the corners of the convex hull of points (N, 2), counter-clockwise (Andrew's monotone chain)."""
+    ordered = sorted(map(tuple, points.tolist()))
+    if len(ordered) < 3:
+        return points
+    hull: list[tuple[float, ...]] = []
+    for way in (ordered, ordered[::-1]):
+        chain: list[tuple[float, ...]] = []
+        for x, y in way:
+            while len(chain) > 1 and (chain[-1][0] - chain[-2][0]) * (y - chain[-2][1]) <= (
+                chain[-1][1] - chain[-2][1]
+            ) * (x - chain[-2][0]):
+                chain.pop()
+            chain.append((x, y))
+        hull += chain[:-1]
+    return np.array(hull)
+
+
+def _label(axes: Axes, at: Array, text: str, colour: str, shift: Sequence[float], **style: Any) -> None:
+    axes.annotate(
+        text, (float(at[0]), float(at[1])), xytext=(shift[0], shift[1]), textcoords="offset points", color=colour,
+        fontsize=8, zorder=8, bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.75}, **style,
+    )  # fmt: skip

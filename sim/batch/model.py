@@ -15,7 +15,7 @@ from echelon.controller.trajectory import Circle, Line, Sine, Waypoints
 from echelon.controller.transformation import desired_shape
 from echelon.messages import Channel
 from echelon.plan.layout import NodeLayout, acceleration_of, length
-from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan
+from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, RobotPlan
 from echelon.sim.batch import records as r
 from echelon.sim.batch.outcomes import fractions
 from echelon.sim.batch.pools import Pools, records_of
@@ -55,9 +55,11 @@ def _reasons(plan: Plan) -> Iterator[str]:
                 yield f"links: the batch engine does not know {field.name}"
         if getattr(link, "policy", "hold") not in _POLICIES:
             yield f"links: the batch engine knows the policies {' and '.join(_POLICIES)} only"
-    late = not all(link.ideal for link in plan.links)
-    if late and any(getattr(one, "event_driven", False) for one in plan.formation):
-        yield "timing = 'event_driven': the batch engine knows late links only where timing = 'time_driven'"
+
+
+def _is_prompt(link: LinkPlan) -> bool:
+    """True if each message is in use from its nominal instant on."""
+    return bool(getattr(link, "prompt", link.ideal))
 
 
 class ModelMaker:
@@ -103,9 +105,10 @@ class ModelMaker:
         """Returns how many messages of a stream are kept: a power of two, above those in flight at any time."""
         most = 1
         for link in self.plan.links:
-            if (link.source, link.channel) == (source, channel) and not link.ideal:
+            if (link.source, link.channel) == (source, channel) and not _is_prompt(link):
+                # A message may be sent a period late, and is asked for a period of the receiver later.
                 asked_ns = self.plan.formation[link.receiver].period_ns
-                most = max(most, (link.delay_max_ns + asked_ns) // link.period_ns + 2)
+                most = max(most, (link.delay_max_ns + asked_ns) // link.period_ns + 4)
         return 1 << (most - 1).bit_length()
 
     def _stream(self, source: int, channel: Channel) -> dict[str, Any]:
@@ -124,7 +127,7 @@ class ModelMaker:
     def _link(self, at: int, stream: Mapping[str, Any]) -> dict[str, Any]:
         link, pools = self.plan.links[at], self.pools
         parts = self._parts(at)
-        size = 0 if link.ideal else max(first + count for first, count in parts)
+        size = 0 if _is_prompt(link) else max(first + count for first, count in parts)
         shift = (
             parts[0][0] if len(parts) == 1 and size else 0
         )  # of a long message that one part of is used, keep only that
@@ -133,13 +136,13 @@ class ModelMaker:
             "mask": stream["mask"],
             "stream_at": stream["at"],
             "stream_marks_at": stream["marks_at"],
-            "ideal": link.ideal,
+            "prompt": _is_prompt(link),
             "delay_min_ns": link.delay_min_ns,
             "delay_span_ns": link.delay_max_ns - link.delay_min_ns,
             "timeout_ns": link.timeout_ns,
             "at": pools.real(size - shift) - shift,
-            "draws_at": pools.real(0 if link.ideal else 4),
-            "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.ideal else stream["mask"] + 1)),
+            "draws_at": pools.real(0 if _is_prompt(link) else 4),
+            "marks_at": pools.whole(r.LINK_WHOLES + (0 if _is_prompt(link) else stream["mask"] + 1)),
             "loss": link.loss,
         }
         for number, (first, count) in enumerate(parts, start=1):
@@ -163,6 +166,8 @@ class ModelMaker:
 
     def _robot(self, robot: RobotPlan) -> dict[str, Any]:
         return motion_of(robot) | {
+            "on_arrival": getattr(robot, "event_driven", False)
+            and not all(map(_is_prompt, self.plan.links_into(robot.index))),
             "at": self.pools.real(r.ROBOT_REALS),
             "stream": self._streams[robot.index, Channel.STATE],
             "link": self._links[robot.parent, robot.index, Channel.COMMAND],
@@ -179,6 +184,8 @@ class ModelMaker:
         return {
             "period_ns": node.period_ns,
             "parent_period_ns": 1 if parent is None else parent.period_ns,
+            "when_heard": getattr(node, "event_driven", False)
+            and not all(map(_is_prompt, plan.links_into(node.index))),
             "count": count,
             "robots": node.robots,
             "links_at": pools.index(links),
@@ -209,6 +216,7 @@ class ModelMaker:
             "order_at": pools.whole(node.robots + 1 if plan.avoidance.enabled else 0),
             "state_at": pools.real(state.size),
             "has_state_at": pools.whole(1),
+            "acted_at": pools.whole(1),
             "own_rates": state.own_rates.start if coupled else -1,
             "centroid_rates": state.centroid_rates.start,
             "rates": state.rates.start,

@@ -7,8 +7,10 @@ from echelon.sim.batch.angles import cos_sin
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.records import (
     COS,
+    HELD_S,
     OMEGA,
     P_LEFT,
+    P_PART,
     P_PEAK,
     P_RIGHT,
     P_SATURATED,
@@ -30,52 +32,102 @@ _MIDDLE: Final = 5 / 12
 
 
 @fused
-def advance(robot: Any, real: Any, ax: float, ay: float, commanded: bool) -> None:
-    """Runs torque loop and plant through one period."""
-    at, h = robot.at, robot.h
-    right_square = left_square = peak = 0.0
-    saturated = 0.0
-    right = left = 0.0
-    for _ in range(robot.torque_periods):
-        if commanded:
-            right, left = inverse(robot, real[at + THETA], real[at + V], real[at + OMEGA], real[at + COS], real[at + SIN],
-                                  ax, ay, 0.5 * h)  # fmt: skip
-        if robot.limited:
-            v, turning = real[at + V], robot.arm * real[at + OMEGA]
-            last_right, last_left = real[at + TAU_RIGHT], real[at + TAU_LEFT]
-            most, change = robot.torque_limit, robot.torque_change
-            if not (
-                abs(right) <= most
-                and abs(left) <= most
-                and abs(right - last_right) <= change
-                and abs(left - last_left) <= change
-                and abs(v) + abs(turning) <= robot.speed_limit
-            ):
-                wanted_right, wanted_left = right, left
-                right = limited(robot, right, last_right, v + turning)
-                left = limited(robot, left, last_left, v - turning)
-                if right != wanted_right or left != wanted_left:
-                    saturated += 1.0
-            real[at + TAU_RIGHT] = right
-            real[at + TAU_LEFT] = left
-        if robot.plant == PAPER:
-            paper_step(robot, real, right, left, h)
-        else:
-            body_step(robot, real, right, left, h)
-        right_square += right * right
-        left_square += left * left
-        peak = max(peak, abs(right), abs(left))
-    real[at + P_RIGHT] = right_square / robot.torque_periods
-    real[at + P_LEFT] = left_square / robot.torque_periods
-    real[at + P_PEAK] = peak
-    real[at + P_SATURATED] = saturated
+def move(robot: Any, real: Any, now_ns: int, until_ns: int, ax: float, ay: float, commanded: bool) -> None:
+    """Runs torque loop and plant from one instant to another with an acceleration."""
+    h_ns = robot.torque_period_ns
+    if now_ns % h_ns == 0 and until_ns - now_ns == h_ns * robot.torque_periods:
+        _pass(robot, real, robot.torque_periods, ax, ay, commanded)
+        return
+    while now_ns < until_ns:
+        left_ns, count = h_ns - now_ns % h_ns, (until_ns - now_ns) // h_ns
+        if left_ns == h_ns and count > 0:
+            _pass(robot, real, count, ax, ay, commanded)
+            now_ns += count * h_ns
+        else:  # an acceleration arrives within this torque period, or has arrived
+            span_ns = min(left_ns, until_ns - now_ns)
+            _pass_part(robot, real, span_ns * 1e-9, left_ns * 1e-9, left_ns == h_ns, ax, ay, commanded)
+            now_ns += span_ns
 
 
 @fused
-def inverse(
-    robot: Any, theta: float, v: float, omega: float, c: float, s: float, ax: float, ay: float, lead: float
-) -> tuple[float, float]:
+def _pass(robot: Any, real: Any, count: int, ax: float, ay: float, commanded: bool) -> None:
+    """Runs torque loop and plant through whole torque periods."""
+    h = robot.h
+    right = left = 0.0
+    for _ in range(count):
+        if commanded:
+            right, left = inverse(robot, real, ax, ay, 0.5 * h)
+        if robot.limited:
+            right, left, acted = limits(robot, real, right, left)
+            real[robot.at + P_SATURATED] += acted
+            real[robot.at + HELD_S] = h
+        _turn_wheels(robot, real, right, left, h, 1.0)
+
+
+@fused
+def _pass_part(
+    robot: Any, real: Any, span: float, left_s: float, first: bool, ax: float, ay: float, commanded: bool
+) -> None:
+    """Runs torque loop and plant through `span` [s] of a torque period of which `left_s` [s] are left; `first`: it begins
+    now."""
+    at = robot.at
+    right = left = 0.0
+    if commanded:
+        right, left = inverse(robot, real, ax, ay, 0.5 * left_s)
+    if first:
+        real[at + P_PART] = 0.0
+    if robot.limited:
+        right, left, acted = limits(robot, real, right, left)
+        if acted > real[at + P_PART]:
+            real[at + P_SATURATED] += 1.0
+            real[at + P_PART] = 1.0
+    real[at + HELD_S] = span
+    _turn_wheels(robot, real, right, left, span, span / robot.h)
+
+
+@fused
+def _turn_wheels(robot: Any, real: Any, right: float, left: float, span: float, share: float) -> None:
+    """Moves a robot with torques through `span` [s], which is this share of a torque period."""
+    at = robot.at
+    if robot.plant == PAPER:
+        paper_step(robot, real, right, left, span)
+    else:
+        body_step(robot, real, right, left, span)
+    real[at + P_RIGHT] += share * right * right
+    real[at + P_LEFT] += share * left * left
+    real[at + P_PEAK] = max(real[at + P_PEAK], abs(right), abs(left))
+
+
+@fused
+def limits(robot: Any, real: Any, right: float, left: float) -> tuple[float, float, float]:
+    """Returns the limited torques, and 1 if one was limited, else 0; keeps them for the next call."""
+    at = robot.at
+    v, turning = real[at + V], robot.arm * real[at + OMEGA]
+    last_right, last_left = real[at + TAU_RIGHT], real[at + TAU_LEFT]
+    most, change = robot.torque_limit, robot.torque_rate_limit * real[at + HELD_S]
+    acted = 0.0
+    if not (
+        abs(right) <= most
+        and abs(left) <= most
+        and abs(right - last_right) <= change
+        and abs(left - last_left) <= change
+        and abs(v) + abs(turning) <= robot.speed_limit
+    ):
+        wanted_right, wanted_left = right, left
+        right = _limited(robot, right, last_right, change, v + turning)
+        left = _limited(robot, left, last_left, change, v - turning)
+        if right != wanted_right or left != wanted_left:
+            acted = 1.0
+    real[at + TAU_RIGHT] = right
+    real[at + TAU_LEFT] = left
+    return right, left, acted
+
+
+@fused
+def inverse(robot: Any, real: Any, ax: float, ay: float, lead: float) -> tuple[float, float]:
     """Returns the wheel torques for a wanted acceleration, for the state after `lead` [s]."""
+    at = robot.at
+    theta, v, omega, c, s = real[at + THETA], real[at + V], real[at + OMEGA], real[at + COS], real[at + SIN]
     d = robot.offset
     v_dot = c * ax + s * ay + d * omega * omega
     omega_dot = (c * ay - s * ax - v * omega) * robot.per_offset
@@ -89,11 +141,12 @@ def inverse(
 
 
 @fused
-def limited(robot: Any, wanted: float, last: float, speed: float) -> float:
-    """Returns the limited torque of one wheel, whose torque was `last`, and which runs over the ground with `speed` [m/s]."""
+def _limited(robot: Any, wanted: float, last: float, change: float, speed: float) -> float:
+    """Returns the limited torque of one wheel, whose torque was `last` and changes by `change` at most.  It runs over the
+    ground with `speed` [m/s]."""
     if wanted != wanted:
         return 0.0
-    tau = min(max(wanted, last - robot.torque_change), last + robot.torque_change)
+    tau = min(max(wanted, last - change), last + change)
     tau = min(max(tau, -robot.torque_limit), robot.torque_limit)
     if abs(speed) > robot.speed_limit and tau * speed > 0.0:
         return 0.0

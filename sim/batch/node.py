@@ -5,16 +5,26 @@ from typing import Any
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.potential import add_pair_forces
-from echelon.sim.batch.streams import hear, room, say
+from echelon.sim.batch.records import FAR
+from echelon.sim.batch.streams import hear, heard_ns, room, say, take_up
 
 
 @fused
 def gather(
     node: Any, run: Any, links: Any, streams: Any, table: Any, index: Any, real: Any, whole: Any,
-    time_ns: int, speaks: bool,
+    due_ns: int, speaks: bool,
 ) -> None:  # fmt: skip
-    """Takes the children's states at `time_ns`; sends the GROUP_STATE if the node `speaks` to its parent in this period."""
+    """Takes the children's states in the period from `due_ns` on; sends the GROUP_STATE if the node `speaks` to its parent in
+    this period."""
     count = node.count
+    time_ns = due_ns
+    if node.when_heard:
+        for child in range(count):
+            take_up(links[index[node.links_at + child]], real, whole)
+        time_ns, last_ns = max(due_ns, whole[node.acted_at]), due_ns + node.period_ns - 1
+        for child in range(count):
+            time_ns = heard_ns(links[index[node.links_at + child]], whole, time_ns, last_ns)
+    whole[node.acted_at] = time_ns
     complete = 1
     for child in range(count):
         said = hear(links[index[node.links_at + child]], real, whole, time_ns)
@@ -27,6 +37,10 @@ def gather(
             there, here, size = index[3 * part], index[3 * part + 1], index[3 * part + 2]
             for value in range(size):
                 real[node.state_at + here + value] = real[said + there + value]
+    if time_ns > run.duration_ns:
+        if speaks:
+            say(streams[node.up], whole, FAR, 1)
+        return
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -72,9 +86,14 @@ def _transform(node: Any, run: Any, table: Any, real: Any, time_ns: int) -> None
 @fused
 def steer(
     node: Any, run: Any, blocks: Any, links: Any, streams: Any, table: Any, index: Any, real: Any, whole: Any,
-    time_ns: int,
+    due_ns: int,
 ) -> None:  # fmt: skip
-    """Takes the parent's reference at `time_ns`; sends REFERENCE and COMMAND to the children."""
+    """Takes the parent's reference in the period from `due_ns` on; sends REFERENCE and COMMAND to the children."""
+    time_ns = whole[node.acted_at]
+    if node.when_heard and node.link >= 0:
+        take_up(links[node.link], real, whole)
+        time_ns = heard_ns(links[node.link], whole, time_ns, due_ns + node.period_ns - 1)
+        whole[node.acted_at] = time_ns
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
@@ -87,6 +106,8 @@ def steer(
             rates, forces = said + node.parent_rates, said + node.parent_forces
     else:
         rates = node.state_at + node.rates
+    if time_ns > run.duration_ns:
+        complete, time_ns = 0, FAR  # it does not act any more
     if not complete:
         if node.reference >= 0:
             say(streams[node.reference], whole, time_ns, 1)

@@ -202,10 +202,10 @@ def _robots(plan: Plan, of_robots: NDArray[np.float64]) -> Records:
 
 def _links(plan: Plan, of_links: NDArray[np.int64]) -> Records:
     sent, delivered, lost, used, held, age_sum, age_max = np.moveaxis(of_links, 2, 0)
-    ideal = np.array([link.ideal for link in plan.links], dtype=bool)
+    prompt = np.array([getattr(link, "prompt", link.ideal) for link in plan.links], dtype=bool)
     links = np.zeros(sent.shape, dtype=LINK_FIELDS)
     links["sent"], links["lost"], links["used"], links["held"] = sent, lost, used, held
-    links["delivered"] = np.where(ideal, sent, delivered)
+    links["delivered"] = np.where(prompt, sent, delivered)
     links["in_flight"] = sent - lost - links["delivered"]
     links["age_mean"] = np.where(used > 0, age_sum / np.maximum(used, 1) / 1e9, np.nan)
     links["age_max"] = np.where(used > 0, age_max / 1e9, np.nan)

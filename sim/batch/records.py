@@ -29,22 +29,24 @@ RUN: Final = _record(
 )
 ROBOT: Final = _record(
     # `at`: its state in `real`; `command`: place of its acceleration in its leader's COMMAND
-    "period_ns torque_periods plant limited at stream link command",
+    "period_ns torque_period_ns torque_periods plant limited on_arrival at stream link command",
     # plant and inverse (agents.plant, agents.torque); lever to always: of the rigid body
     "h per_sum per_difference offset half_sum half_difference lever pull_x pull_y drag turn_drag always "
-    "per_offset torque_limit torque_change speed_limit arm x y heading",
+    "per_offset torque_limit torque_rate_limit speed_limit arm x y heading",
 )
 NODE: Final = _record(
-    # number of children and of robots below; in `table` w_k/(w_1 + … + w_k) and 1/w_k of each child k; in `indices` links from
-    # the children, their indices, the bounds of their robots, each robot's child, and what of their messages is carried up
-    "period_ns parent_period_ns count robots shares_at means_at links_at children_at bounds_at child_of_at carried_at "
+    # whether it waits for its inputs; number of children and of robots below; in `table` w_k/(w_1 + … + w_k) and 1/w_k of each
+    # child k; in `indices` links from the children, their indices, the bounds of their robots, each robot's child, and what of
+    # their messages is carried up
+    "period_ns parent_period_ns when_heard count robots shares_at means_at links_at children_at bounds_at child_of_at "
+    "carried_at "
     # streams that it sends, the link from its parent, and places in its parent's REFERENCE
     "up reference command link acceleration parent_rates parent_forces "
     # its block, and its desired shape in `table`; scratch: s, e, acceleration of its centroid, η, accelerations, F_pot, forces,
     # and its robots in order (potential)
     "block desired_at s_at e_at c_at eta_at a_at f_pot_at forces_at order_at "
-    # its GROUP_STATE, whether it has one, and places in it
-    "state_at has_state_at own_rates centroid_rates rates rates_size positions",
+    # its GROUP_STATE, whether it has one, when it acted last, and places in its GROUP_STATE
+    "state_at has_state_at acted_at own_rates centroid_rates rates rates_size positions",
     "",
 )
 BLOCK: Final = _record(
@@ -61,7 +63,7 @@ STREAM: Final = _record(
 LINK: Final = _record(
     # its stream, as above; `at`: the message in use in `real`; `draws_at`: draws of two messages; places and sizes of the parts
     # that the receiver uses of a message
-    "size mask stream_at stream_marks_at ideal delay_min_ns delay_span_ns timeout_ns at draws_at marks_at "
+    "size mask stream_at stream_marks_at prompt delay_min_ns delay_span_ns timeout_ns at draws_at marks_at "
     "first_1 size_1 first_2 size_2 first_3 size_3",
     "loss",
 )
@@ -74,18 +76,19 @@ LINE, CIRCLE, SINE, WAYPOINTS = 0, 1, 2, 3
 """`RUN.trajectory`"""
 
 # Places in a robot's part of `real`.
-X, Y, THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT = range(9)
-P_RIGHT, P_LEFT, P_PEAK, P_SATURATED = range(9, 13)
-"""Of the period that ends now: mean squares of the torques, largest torque, torque periods in which a limit acted"""
-S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(13, 19)
-"""The same of all periods so far; those after the first second; number of periods"""
-ROBOT_REALS: Final = 19
+X, Y, THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT, HELD_S = range(10)
+"""... torques last held, and how long they were held [s]"""
+P_RIGHT, P_LEFT, P_PEAK, P_SATURATED, P_PART = range(10, 15)
+"""Of the period so far, in torque periods: sums of the torques' squares, largest torque, torque periods in which a limit acted;
+whether one acted in an earlier part of the present torque period"""
+S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(15, 21)
+"""The same of all periods so far, squares as means; those after the first second; number of periods"""
+ROBOT_REALS: Final = 21
 
 # Places in a link's part of `whole`.
-TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, USED, HELD, AGE_SUM, AGE_MAX, NEXT, OLDEST, KEY_0, KEY_1 = range(
-    15
-)
-LINK_WHOLES: Final = 15
+TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, USED, HELD, AGE_SUM, AGE_MAX, NEXT, NEWEST, OLDEST = range(14)
+KEY_0, KEY_1 = 14, 15
+LINK_WHOLES: Final = 16
 """After these come the arrivals of the messages in flight [ns]"""
 COUNTS: Final = (TAKEN, DELIVERED, LOST, USED, HELD, AGE_SUM, AGE_MAX)
 """What of these is a result"""

@@ -15,6 +15,7 @@ def motion_of(robot: RobotPlan) -> dict[str, Any]:
     infinite = float("inf")
     found = {
         "period_ns": robot.period_ns,
+        "torque_period_ns": robot.torque_period_ns,
         "torque_periods": robot.period_ns // robot.torque_period_ns,
         "limited": min(robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit) != infinite,
         "h": h,
@@ -23,7 +24,7 @@ def motion_of(robot: RobotPlan) -> dict[str, Any]:
         "half_sum": m * radius / 2,
         "half_difference": (robot.inertia - m * d * d) * radius / (d * arm) / 2,
         "torque_limit": robot.torque_limit,
-        "torque_change": robot.torque_rate_limit * h,
+        "torque_rate_limit": robot.torque_rate_limit,
         "speed_limit": robot.wheel_speed_limit * radius,
         "arm": arm,
         "x": robot.start[0],

@@ -22,6 +22,7 @@ from echelon.sim.batch.records import (
     LAST,
     LINK_WHOLES,
     LOST,
+    NEWEST,
     NEXT,
     OLDEST,
     STAMP,
@@ -51,16 +52,16 @@ def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
     """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
     use.  Must be called with ascending instants."""
     marks = link.marks_at
-    if link.ideal:
+    if link.prompt:
         number = whole[link.stream_marks_at] - 1
         whole[marks + TAKEN] = number + 1
         mark = link.stream_marks_at + 1 + 2 * (number & link.mask)
         stamp, is_null = whole[mark], whole[mark + 1]
         place = link.stream_at + (number & link.mask) * link.size
     else:
-        _take(link, real, whole)
-        if whole[marks + NEXT] <= time_ns:
-            _receive(link, real, whole, time_ns)
+        take_up(link, real, whole)
+        receive(link, whole, time_ns)
+        _use(link, real, whole)
         number, stamp, is_null = whole[marks + IN_USE], whole[marks + STAMP], whole[marks + IS_NULL]
         place = link.at
     age = time_ns - stamp
@@ -78,8 +79,10 @@ def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
 
 
 @compiled
-def _take(link: Any, real: Any, whole: Any) -> None:
+def take_up(link: Any, real: Any, whole: Any) -> None:
     """Draws what becomes of the messages that were sent since the last call."""
+    if link.prompt:
+        return
     marks = link.marks_at
     number = whole[marks + TAKEN]
     while number < whole[link.stream_marks_at]:
@@ -125,11 +128,12 @@ def _rounded(value: float) -> int:
 
 
 @compiled
-def _receive(link: Any, real: Any, whole: Any, time_ns: int) -> None:
-    """Counts the messages that have arrived by `time_ns`, and takes the newest of them into use if it is newer than the one in
-    use."""
+def receive(link: Any, whole: Any, time_ns: int) -> None:
+    """Counts the messages that have arrived by `time_ns`, and notes the newest of them."""
     marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
-    newest, next_ns = -1, FAR
+    if link.prompt or whole[marks + NEXT] > time_ns:
+        return
+    next_ns = FAR
     taken = whole[marks + TAKEN]
     oldest = max(whole[marks + OLDEST], taken - link.mask - 1)  # what is older has arrived or is lost
     for number in range(oldest, taken):
@@ -139,13 +143,19 @@ def _receive(link: Any, real: Any, whole: Any, time_ns: int) -> None:
         if whole[arrival] <= time_ns:
             whole[arrival] = GONE
             whole[marks + DELIVERED] += 1
-            newest = number
+            whole[marks + NEWEST] = max(whole[marks + NEWEST], number)
         else:
             next_ns = min(next_ns, whole[arrival])
     while oldest < taken and whole[arrivals + (oldest & link.mask)] == GONE:
         oldest += 1
     whole[marks + OLDEST] = oldest
     whole[marks + NEXT] = next_ns
+
+
+@compiled
+def _use(link: Any, real: Any, whole: Any) -> None:
+    """Takes the newest message that has arrived into use."""
+    marks, newest = link.marks_at, whole[link.marks_at + NEWEST]
     if newest <= whole[marks + IN_USE]:
         return
     mark = link.stream_marks_at + 1 + 2 * (newest & link.mask)
@@ -157,6 +167,44 @@ def _receive(link: Any, real: Any, whole: Any, time_ns: int) -> None:
         _copy(real, source + link.first_1, link.at + link.first_1, link.size_1)
         _copy(real, source + link.first_2, link.at + link.first_2, link.size_2)
         _copy(real, source + link.first_3, link.at + link.first_3, link.size_3)
+
+
+@compiled
+def heard_ns(link: Any, whole: Any, at_ns: int, last_ns: int) -> int:
+    """Returns the first instant from `at_ns` on at which a link has something newer than is in use, at the latest `last_ns`; it
+    is `at_ns` if nothing newer was sent (echelon.runtime.mailbox)."""
+    marks = link.marks_at
+    if link.prompt or whole[marks + TAKEN] - 1 <= whole[marks + IN_USE]:
+        return at_ns
+    receive(link, whole, at_ns)
+    if whole[marks + NEWEST] > whole[marks + IN_USE]:
+        return at_ns
+    return max(at_ns, min(last_ns, _next_arrival_ns(link, whole)))
+
+
+@compiled
+def change_ns(link: Any, whole: Any, time_ns: int) -> int:
+    """Returns the first instant after `time_ns` at which something newer arrives, or at which the message in use becomes too
+    old."""
+    marks = link.marks_at
+    change = _next_arrival_ns(link, whole)
+    if link.timeout_ns < FAR and whole[marks + IN_USE] >= 0 and whole[marks + IS_NULL] == 0:
+        expires_ns = whole[marks + STAMP] + link.timeout_ns + 1
+        if expires_ns > time_ns:
+            change = min(change, expires_ns)
+    return int(change)
+
+
+@compiled
+def _next_arrival_ns(link: Any, whole: Any) -> int:
+    """Returns when the next message arrives that is newer than the one in use; `FAR` if there is none."""
+    marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
+    taken, found = whole[marks + TAKEN], FAR
+    for number in range(max(whole[marks + IN_USE] + 1, taken - link.mask - 1), taken):
+        arrival = whole[arrivals + (number & link.mask)]
+        if arrival != GONE:
+            found = min(found, arrival)
+    return int(found)
 
 
 @compiled

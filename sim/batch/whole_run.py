@@ -5,19 +5,22 @@ from typing import Any, Final
 
 from echelon.sim.batch.compiled import compiled, is_kept
 from echelon.sim.batch.measures import measure
-from echelon.sim.batch.motion import advance
+from echelon.sim.batch.motion import move
 from echelon.sim.batch.node import gather, steer
 from echelon.sim.batch.records import (
     COS,
     FAR,
+    HELD_S,
     IN_USE,
     KEY_0,
     KEY_1,
     LAST,
     M_FINITE,
+    NEWEST,
     NEXT,
     OMEGA,
     P_LEFT,
+    P_PART,
     P_PEAK,
     P_RIGHT,
     P_SATURATED,
@@ -33,7 +36,7 @@ from echelon.sim.batch.records import (
     X,
     Y,
 )
-from echelon.sim.batch.streams import hear, room, say
+from echelon.sim.batch.streams import change_ns, hear, room, say
 
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
@@ -84,14 +87,25 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
         for number in range(len(robots)):
             if time_ns == whole[run.due_at + number]:
                 robot = robots[number]
-                said = hear(links[robot.link], real, whole, time_ns)
-                if said < 0:
-                    advance(robot, real, 0.0, 0.0, False)
-                else:
-                    at = said + robot.command
-                    advance(robot, real, real[at], real[at + 1], True)
+                _obey(robot, links[robot.link], real, whole, time_ns)
                 whole[run.due_at + number] += robot.period_ns
     return lost_ns
+
+
+@compiled
+def _obey(robot: Any, link: Any, real: Any, whole: Any, due_ns: int) -> None:
+    """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
+    now_ns, end_ns = due_ns, due_ns + robot.period_ns
+    while now_ns < end_ns:
+        said, until_ns = hear(link, real, whole, now_ns), end_ns
+        if robot.on_arrival:
+            until_ns = min(end_ns, change_ns(link, whole, now_ns))
+        if said < 0:
+            move(robot, real, now_ns, until_ns, 0.0, 0.0, False)
+        else:
+            at = said + robot.command
+            move(robot, real, now_ns, until_ns, real[at], real[at + 1], True)
+        now_ns = until_ns
 
 
 @compiled
@@ -105,11 +119,12 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
         real[robot.at + X] = robot.x
         real[robot.at + Y] = robot.y
         real[robot.at + THETA] = robot.heading
+        real[robot.at + HELD_S] = robot.h
         real[robot.at + COS] = cos(robot.heading)
         real[robot.at + SIN] = sin(robot.heading)
     for number in range(len(links)):
         marks = links[number].marks_at
-        whole[marks + IN_USE] = whole[marks + LAST] = -1
+        whole[marks + IN_USE] = whole[marks + NEWEST] = whole[marks + LAST] = -1
         whole[marks + NEXT] = FAR
         whole[marks + KEY_0], whole[marks + KEY_1] = keys[number, 0], keys[number, 1]
     for number in range(len(blocks)):
@@ -137,16 +152,19 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
     real[place + 2] = v * c - across * s
     real[place + 3] = v * s + across * c
     say(stream, whole, time_ns, 0)
+    total = real[place] + real[place + 1] + real[place + 2] + real[place + 3] + real[at + THETA]
+    total += real[at + OMEGA] + real[at + P_RIGHT] + real[at + P_LEFT] + real[at + P_PEAK]
     if time_ns > 0:
-        real[at + S_RIGHT] += real[at + P_RIGHT]
-        real[at + S_LEFT] += real[at + P_LEFT]
+        real[at + S_RIGHT] += real[at + P_RIGHT] / robot.torque_periods
+        real[at + S_LEFT] += real[at + P_LEFT] / robot.torque_periods
         real[at + S_PEAK] = max(real[at + S_PEAK], real[at + P_PEAK])
         real[at + S_SATURATED] += real[at + P_SATURATED]
         real[at + S_PERIODS] += 1.0
         if time_ns > STARTED_NS:
             real[at + S_LATE] += real[at + P_SATURATED]
-    total = real[place] + real[place + 1] + real[place + 2] + real[place + 3] + real[at + THETA]
-    return isfinite(total + real[at + OMEGA] + real[at + P_RIGHT] + real[at + P_LEFT] + real[at + P_PEAK])
+        for place in range(at + P_RIGHT, at + P_PART):
+            real[place] = 0.0
+    return isfinite(total)
 
 
 @compiled

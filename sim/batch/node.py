@@ -5,7 +5,6 @@ from typing import Any
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.potential import add_pair_forces
-from echelon.sim.batch.records import FAR
 from echelon.sim.batch.streams import hear, heard_ns, room, say, take_up
 
 
@@ -21,7 +20,7 @@ def gather(
     if node.when_heard:
         for child in range(count):
             take_up(links[index[node.links_at + child]], real, whole)
-        time_ns, last_ns = max(due_ns, whole[node.acted_at]), due_ns + node.period_ns - 1
+        time_ns, last_ns = max(due_ns, whole[node.acted_at]), _last_ns(node, run, due_ns)
         for child in range(count):
             time_ns = heard_ns(links[index[node.links_at + child]], whole, time_ns, last_ns)
     whole[node.acted_at] = time_ns
@@ -37,10 +36,6 @@ def gather(
             there, here, size = index[3 * part], index[3 * part + 1], index[3 * part + 2]
             for value in range(size):
                 real[node.state_at + here + value] = real[said + there + value]
-    if time_ns > run.duration_ns:
-        if speaks:
-            say(streams[node.up], whole, FAR, 1)
-        return
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -51,6 +46,12 @@ def gather(
             for value in range(up.size):
                 real[place + value] = real[node.state_at + value]
         say(up, whole, time_ns, 1 - complete)
+
+
+@fused
+def _last_ns(node: Any, run: Any, due_ns: int) -> int:
+    """Returns the last instant at which a node may act that is due at `due_ns`: nothing acts after the end of the run."""
+    return int(max(due_ns, min(due_ns + node.period_ns - 1, run.duration_ns)))
 
 
 @fused
@@ -92,7 +93,7 @@ def steer(
     time_ns = whole[node.acted_at]
     if node.when_heard and node.link >= 0:
         take_up(links[node.link], real, whole)
-        time_ns = heard_ns(links[node.link], whole, time_ns, due_ns + node.period_ns - 1)
+        time_ns = heard_ns(links[node.link], whole, time_ns, _last_ns(node, run, due_ns))
         whole[node.acted_at] = time_ns
     complete = whole[node.has_state_at]
     rates = forces = -1
@@ -106,8 +107,6 @@ def steer(
             rates, forces = said + node.parent_rates, said + node.parent_forces
     else:
         rates = node.state_at + node.rates
-    if time_ns > run.duration_ns:
-        complete, time_ns = 0, FAR  # it does not act any more
     if not complete:
         if node.reference >= 0:
             say(streams[node.reference], whole, time_ns, 1)

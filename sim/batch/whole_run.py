@@ -87,19 +87,20 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
         for number in range(len(robots)):
             if time_ns == whole[run.due_at + number]:
                 robot = robots[number]
-                _obey(robot, links[robot.link], real, whole, time_ns)
+                _obey(run, robot, links[robot.link], real, whole, time_ns)
                 whole[run.due_at + number] += robot.period_ns
     return lost_ns
 
 
 @compiled
-def _obey(robot: Any, link: Any, real: Any, whole: Any, due_ns: int) -> None:
+def _obey(run: Any, robot: Any, link: Any, real: Any, whole: Any, due_ns: int) -> None:
     """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
     now_ns, end_ns = due_ns, due_ns + robot.period_ns
     while now_ns < end_ns:
         said, until_ns = hear(link, real, whole, now_ns), end_ns
         if robot.on_arrival:
-            until_ns = min(end_ns, change_ns(link, whole, now_ns))
+            change = change_ns(link, whole, now_ns)
+            until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
         if said < 0:
             move(robot, real, now_ns, until_ns, 0.0, 0.0, False)
         else:

@@ -24,9 +24,9 @@ from math import ceil, cos, hypot, isfinite, nan, sin, sqrt
 from typing import Final, NamedTuple
 
 from echelon.errors import PartRunError
+from echelon.parameters import NonNegative, Point
 from echelon.plan.plan import RobotPlan
 from echelon.plugins import Plugin
-from echelon.scenario.values import NonNegative, Point
 
 GRAVITY: Final = 9.81
 """Acceleration of gravity [m/s²]"""

@@ -7,6 +7,7 @@ the robot sends the wanted torques in TORQUE messages, and moves with the torque
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import nan
 
 import numpy as np
@@ -16,12 +17,16 @@ from echelon.agents.torque import TorqueLimits, make_inverse
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.layout import acceleration_of
 from echelon.plan.plan import Plan
-from echelon.role import Input, Stage
+from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
 
 
 class Robot:
-    """One robot of a plan, where torque is mirrored: it moves with the torques that it computes."""
+    """One robot of a plan, where torque is mirrored: it moves with the torques that it computes.
+
+    It computes torques at the beginning of each torque period.  An event-driven robot takes an acceleration in the instant of
+    its arrival, and computes torques anew for the rest of the torque period (docs/architecture.md, 4.6).  The motion up to an
+    instant is computed when it is needed: when the robot sends its state, and when an acceleration arrives."""
 
     def __init__(self, plan: Plan, index: int) -> None:
         robot = plan.robots[index]
@@ -36,49 +41,78 @@ class Robot:
             limit != float("inf") for limit in (robot.torque_limit, robot.torque_rate_limit, robot.wheel_speed_limit)
         )
         self._torque_periods = robot.period_ns // robot.torque_period_ns
-        self._h = robot.torque_period_ns * 1e-9
-        self._acceleration = acceleration_of(robot)
+        self._h_ns, self._h = robot.torque_period_ns, robot.torque_period_ns * 1e-9
+        self._acceleration_part = acceleration_of(robot)
         self.state = state_at(*robot.start, robot.heading, 0.0, 0.0)
+        self._moved_ns = 0  # instant of `state`
+        self._a: tuple[float, float] | None = None  # commanded acceleration [m/s²]; None: no command
+        self._held = self._h  # how long the torques have been held that the limits know [s]
+        self._sums = _TorqueSums()
         self._period_values = (0.0,) * 9
+        acts = Acts.ON_ARRIVAL if robot.event_driven else Acts.AT_INSTANT
         self.stages: tuple[Stage, ...] = (
             Stage(Turn.SAY, robot.period_ns, (), self._say),
-            Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
+            Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._obey, acts=acts),
         )
 
     def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Returns the STATE message at `time_ns`."""
+        if time_ns > 0:
+            self._end_period(time_ns)
         x, y, theta, v, omega, c, s = self.state
         across = self._plan.offset * omega
         values = np.array((x, y, v * c - across * s, v * s + across * c, theta, v, omega, *self._period_values))
         return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
 
-    def _move(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Moves to the end of the period that begins at `time_ns`, with the commanded acceleration, or with zero torque if
-        there is no command."""
+    def _obey(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        """Follows the commanded acceleration from `time_ns` on; without a command the torques are zero."""
+        if time_ns > self._moved_ns:
+            self._move(time_ns)
         command = heard[0]
-        if command is None:
-            ax = ay = 0.0
-        else:
-            ax, ay = command.values[self._acceleration].tolist()
-        try:
-            self._advance(ax, ay, command is not None)
-        except (ValueError, OverflowError):  # the run diverged: angles and speeds overflow
-            self.state = LOST
-            self._period_values = (ax, ay, nan, nan, nan, nan, nan, nan, 0.0)
+        self._a = None
+        if command is not None:
+            ax, ay = command.values[self._acceleration_part].tolist()
+            self._a = ax, ay
         return ()
 
-    def _advance(self, ax: float, ay: float, commanded: bool) -> None:
-        """Runs the torque loop and the plant through one period."""
-        h, state, step, inverse, limits = self._h, self.state, self._step, self._inverse, self._limits
-        right_sum = left_sum = right_square = left_square = right_peak = left_peak = 0.0
-        saturated = 0
+    def _end_period(self, time_ns: int) -> None:
+        """Moves to the end of a period, and sums it up for the STATE message."""
+        self._move(time_ns)
+        self._period_values = (*(self._a or (0.0, 0.0)), *self._sums.taken(self._torque_periods))
+
+    def _move(self, until_ns: int) -> None:
+        """Moves until an instant with the acceleration that holds."""
+        h_ns = self._h_ns
+        try:
+            while (now_ns := self._moved_ns) < until_ns:
+                left_ns, whole = h_ns - now_ns % h_ns, (until_ns - now_ns) // h_ns
+                if left_ns == h_ns and whole:
+                    self._moved_ns += whole * h_ns
+                    self._pass_torque_periods(whole)
+                else:  # an acceleration arrives within this torque period, or has arrived
+                    span_ns = min(left_ns, until_ns - now_ns)
+                    self._moved_ns += span_ns
+                    self._pass_part(span_ns * 1e-9, left_ns * 1e-9, first=left_ns == h_ns)
+        except (ValueError, OverflowError):  # the run diverged: angles and speeds overflow
+            self.state = LOST
+            self._sums.lose()
+            self._moved_ns = until_ns
+
+    def _pass_torque_periods(self, count: int) -> None:
+        """Runs the torque loop and the plant through whole torque periods."""
+        h, state, step, inverse, limits, sums = self._h, self.state, self._step, self._inverse, self._limits, self._sums
+        right_sum, left_sum, right_square, left_square = sums.right, sums.left, sums.right_square, sums.left_square
+        right_peak, left_peak, saturated = sums.right_peak, sums.left_peak, sums.saturated
+        commanded, held = self._a is not None, self._held
+        ax, ay = self._a or (0.0, 0.0)
         right = left = 0.0
-        for _ in range(self._torque_periods):
+        for _ in range(count):
             if commanded:
                 right, left = inverse(state, ax, ay, 0.5 * h)
             if self._limited:
-                right, left, limited = limits.apply(right, left, state.v, state.omega, h)
+                right, left, limited = limits.apply(right, left, state.v, state.omega, held)
                 saturated += limited
+                held = h
             state = step(state, right, left, h)
             right_sum += right
             left_sum += left
@@ -86,11 +120,72 @@ class Robot:
             left_square += left * left
             right_peak = max(right_peak, abs(right))
             left_peak = max(left_peak, abs(left))
-        self.state = state
-        n = self._torque_periods
-        self._period_values = (
-            ax, ay, right_sum / n, left_sum / n, right_square / n, left_square / n, right_peak, left_peak, float(saturated),
-        )  # fmt: skip
+        self.state, self._held = state, held
+        sums.right, sums.left, sums.right_square, sums.left_square = right_sum, left_sum, right_square, left_square
+        sums.right_peak, sums.left_peak, sums.saturated = right_peak, left_peak, saturated
+
+    def _pass_part(self, span: float, left: float, *, first: bool) -> None:
+        """Runs the torque loop and the plant through `span` [s] of a torque period of which `left` [s] are left.
+
+        `first`: the torque period begins now."""
+        state, sums = self.state, self._sums
+        right = left_torque = 0.0
+        if self._a is not None:
+            right, left_torque = self._inverse(state, *self._a, 0.5 * left)
+        if first:
+            sums.part_saturated = False
+        if self._limited:
+            right, left_torque, limited = self._limits.apply(right, left_torque, state.v, state.omega, self._held)
+            sums.saturated += limited and not sums.part_saturated
+            sums.part_saturated |= limited
+        self._held = span
+        self.state = self._step(state, right, left_torque, span)
+        sums.add(right, left_torque, span / self._h)
+
+
+@dataclass(slots=True)
+class _TorqueSums:
+    """Sums over the torques of one period, in torque periods."""
+
+    right: float = 0.0
+    left: float = 0.0
+    right_square: float = 0.0
+    left_square: float = 0.0
+    right_peak: float = 0.0
+    left_peak: float = 0.0
+    saturated: int = 0
+    """Torque periods in which a torque was limited"""
+    part_saturated: bool = False
+    """True if a torque was limited in an earlier part of the present torque period"""
+
+    def add(self, right: float, left: float, share: float) -> None:
+        """Adds torques that were held for a share of a torque period."""
+        self.right += share * right
+        self.left += share * left
+        self.right_square += share * right * right
+        self.left_square += share * left * left
+        self.right_peak = max(self.right_peak, abs(right))
+        self.left_peak = max(self.left_peak, abs(left))
+
+    def lose(self) -> None:
+        """Makes the sums NaN: the run diverged."""
+        self.right = self.left = self.right_square = self.left_square = self.right_peak = self.left_peak = nan
+        self.saturated = 0
+
+    def taken(self, count: int) -> tuple[float, float, float, float, float, float, float]:
+        """Returns mean, mean square and peak of both torques and the saturated torque periods, and begins anew."""
+        values = (
+            self.right / count,
+            self.left / count,
+            self.right_square / count,
+            self.left_square / count,
+            self.right_peak,
+            self.left_peak,
+            float(self.saturated),
+        )
+        self.right = self.left = self.right_square = self.left_square = self.right_peak = self.left_peak = 0.0
+        self.saturated = 0
+        return values
 
 
 class RobotOnBus(Robot):
@@ -126,12 +221,10 @@ class RobotOnBus(Robot):
             self.state = self._step(self.state, right, left, self._h)
         except (ValueError, OverflowError):  # the run diverged
             self.state = LOST
-        if time_ns % self._plan.period_ns == 0:
-            self._sum_up()
         return ()
 
-    def _sum_up(self) -> None:
-        """Sums up the torques of the period that ends, for the next STATE message."""
+    def _end_period(self, time_ns: int) -> None:
+        """Sums up the torques of the period that ends; the motion is that of CATCH_UP."""
         right, left = zip(*self._torques, strict=True)
         n = len(self._torques)
         self._period_values = (
@@ -156,7 +249,7 @@ class RobotOnBus(Robot):
             self._commanded = (0.0, 0.0)
             self._limits.tau_right = self._limits.tau_left = 0.0
         else:
-            ax, ay = self._commanded = command.values[self._acceleration].tolist()
+            ax, ay = self._commanded = command.values[self._acceleration_part].tolist()
             try:
                 right, left = self._inverse(state, ax, ay, 0.5 * self._h)
             except (ValueError, OverflowError):

@@ -58,7 +58,7 @@ class TorqueLimits:
     tau_left: float = 0.0
 
     def apply(self, tau_right: float, tau_left: float, v: float, omega: float, h: float) -> tuple[float, float, bool]:
-        """Returns the limited torques for the wanted ones over the next `h` [s], and whether one was limited.
+        """Returns the limited torques for the wanted ones, and whether one was limited.  The last ones were held for `h` [s].
 
         The limits act in this order: rate of change, magnitude, wheel speed.  Beyond the limit of its speed (v ± R ω)/r a
         wheel gets no torque in its direction of motion.  A torque that is NaN becomes zero and counts as limited.

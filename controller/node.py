@@ -29,7 +29,7 @@ from echelon.controller.transformation import desired_shape, node_matrix
 from echelon.messages import NULL, Channel, Heard, Message, Values
 from echelon.plan.layout import CENTROID, NodeLayout
 from echelon.plan.plan import Array, NodePlan, Plan
-from echelon.role import Input, Stage
+from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
 
 
@@ -116,14 +116,15 @@ class TreeNode:
             Input(child, Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE) for child in node.children
         )
         parents = () if node.parent is None else (Input(node.parent, Channel.REFERENCE),)
+        acts = Acts.WHEN_HEARD if node.event_driven else Acts.AT_INSTANT
         self.stages = (
-            Stage(Turn.GATHER, node.period_ns, children, self._gather, depth=node.depth),
-            Stage(Turn.STEER, node.period_ns, parents, self._steer, depth=node.depth),
+            Stage(Turn.GATHER, node.period_ns, children, self._gather, acts=acts, depth=node.depth),
+            Stage(Turn.STEER, node.period_ns, parents, self._steer, acts=acts, depth=node.depth),
         )
 
     def _gather(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        """Takes the children's states; returns the GROUP_STATE if the parent runs at this instant.  It is a null message if the
-        state of a child is missing."""
+        """Takes the children's states; returns the GROUP_STATE if the parent is due when the node is.  It is a null message if
+        the state of a child is missing."""
         said = [message.values for message in heard if message is not None]
         if len(said) < len(heard):
             self._s = None
@@ -176,8 +177,9 @@ class TreeNode:
         return self._say_down(time_ns, further, accelerations)
 
     def _say_up(self, time_ns: int, state: Values) -> tuple[Message, ...]:
-        """Returns the message to the parent; none at instants at which the parent does not run."""
-        if self._parent is None or time_ns % self._parent.period_ns:
+        """Returns the message to the parent; none if the parent is not due when the node is."""
+        due_ns = time_ns - time_ns % self._node.period_ns
+        if self._parent is None or due_ns % self._parent.period_ns:
             return ()
         return (Message(Channel.GROUP_STATE, self.index, time_ns // self._parent.period_ns, time_ns, state),)
 

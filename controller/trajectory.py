@@ -6,15 +6,14 @@ To add one, derive a class from `Trajectory` (echelon.plugins).
 
 from abc import ABC, abstractmethod
 from math import cos, sin
-from typing import Annotated, Any, Final, Protocol, Self
+from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from echelon.errors import PartRunError
+from echelon.parameters import Finite, Limits, NonNegative, Point, Positive
 from echelon.plan.plan import Array
 from echelon.plugins import Part, Plugin
-from echelon.scenario.values import Finite, NonNegative, Point, Positive
 
 
 class Trajectory(Plugin, ABC):
@@ -99,18 +98,16 @@ class Waypoints(Trajectory):
     Before the first and after the last of `times` it rests.
     """
 
-    points: Annotated[list[Point], Field(min_length=2)]
+    points: Annotated[list[Point], Limits(min_length=2)]
     """Desired positions of the centroid, one after the other [m]"""
-    times: Annotated[list[NonNegative], Field(min_length=2)]
+    times: Annotated[list[NonNegative], Limits(min_length=2)]
     """The time at which it is at each point [s], ascending"""
 
-    @model_validator(mode="after")
-    def _times(self) -> Self:
+    def __post_init__(self) -> None:
         if len(self.times) != len(self.points):
             raise ValueError(f"{len(self.points)} points need as many times, not {len(self.times)}")
         if any(late <= early for early, late in zip(self.times, self.times[1:], strict=False)):
             raise ValueError("times must ascend, and no two be equal")
-        return self
 
     def at(self, t: float) -> Array:
         """Returns z_cd, ż_cd and z̈_cd at t, (3, 2)."""

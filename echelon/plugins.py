@@ -1,33 +1,26 @@
 """Parts of a run that users can write themselves: laws, plants, trajectories and drive protocols.
 
-A part is a class derived from the base class of its group (Law, Plant, Trajectory, DriveProtocol).  It is a pydantic model:
-its fields are the parameters that a scenario gives, and pydantic checks them.  A scenario names a part in one of three ways:
+A part is a class derived from the base class of its group (Law, Plant, Trajectory, DriveProtocol).  It is a frozen dataclass:
+its fields are the parameters that a scenario gives.  `echelon.part_groups` finds the class that a scenario names, and has its
+parameters checked by pydantic.  No module of a part needs pydantic, so the processes of a run do not import it.
 
-    use = "circle"                    built into this package
-    use = "spiral"                    installed: an entry point of the group `echelon.trajectories`
-    use = "my_paths.py:Spiral"        a class in a Python file beside the scenario
-
-A file is read once, when the scenario is loaded.  Its text travels with the plan to every process of a run.  So all processes
-run the same code even if the file changes meanwhile, and no folder is added to Python's module path.
+A part from a file is read once, when the scenario is loaded.  The file's text travels with the plan to every process of a run.
+So all processes run the same code even if the file changes meanwhile, and no folder is added to Python's module path.
 """
 
 import ast
 import hashlib
-import re
+import pickle
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from difflib import get_close_matches
-from importlib.metadata import entry_points
+from copy import deepcopy
+from dataclasses import FrozenInstanceError, dataclass, field, fields
+from functools import partial
 from io import StringIO
 from multiprocessing import parent_process
-from pathlib import Path
 from traceback import walk_tb
 from types import ModuleType
-from typing import Any, Final, Generic, TypeVar
-
-from pydantic import BaseModel, ConfigDict, PydanticUserError, ValidationError
-from pydantic_core import ErrorDetails
+from typing import Any, ClassVar, Final, Generic, TypeVar, dataclass_transform
 
 from echelon.errors import PartRunError
 
@@ -35,10 +28,6 @@ T_co = TypeVar("T_co", covariant=True)
 
 GROUPS: Final = ("laws", "plants", "trajectories", "protocols")
 """The kinds of parts; `echelon.<group>` is the group of their entry points."""
-
-
-_NO_TYPE: Final = re.compile(r"non-annotated attribute was detected: `(\w+) = (.*?)`")
-"""What pydantic says of a field without a type"""
 
 
 class PartError(ValueError):
@@ -52,8 +41,8 @@ class PartError(ValueError):
         text: str,
         keys: tuple[str, ...] = (),
         shown: Any = None,
-        errors: Sequence[ErrorDetails] = (),
-        model: type[BaseModel] | None = None,
+        errors: Sequence[Any] = (),
+        model: "type[Plugin] | None" = None,
     ) -> None:
         super().__init__(text)
         self.text, self.keys, self.shown, self.errors, self.model = text, keys, shown, errors, model
@@ -63,15 +52,33 @@ class PartError(ValueError):
         return PartError(self.text, keys, shown, self.errors, self.model)
 
 
-class Plugin(BaseModel):
-    """Base class of every part: a frozen pydantic model.  Its fields are the parameters; unknown keys are mistakes."""
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+@dataclass(frozen=True)
+class Plugin:
+    """Base class of every part.  A derived class is a frozen dataclass, whose fields are the parameters.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    Raises PartError for an attribute that has a value but no type: a scenario could not set it."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+    """For pydantic: unknown parameters are mistakes"""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        inherited = {name for base in cls.__mro__[1:] for name in vars(base)} - {one.name for one in fields(cls)}
+        for name, value in list(vars(cls).items()):
+            if name in cls.__annotations__:
+                if type(value).__hash__ is None:  # a list or the like, of which every part gets its own
+                    setattr(cls, name, field(default_factory=partial(deepcopy, value)))
+            elif not (
+                name.startswith("_") or name in inherited or hasattr(value, "__get__") or isinstance(value, type)
+            ):
+                raise PartError(f"{name} needs a type: {name}: {_type_of(value)} = {value!r}")
+        dataclass(frozen=True, kw_only=True)(cls)
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The Python file that a part comes from."""
+    """A file that a scenario names: the Python file of a part, or a trace of delays."""
 
     name: str
     """The path as the scenario gives it, relative to the scenario's folder"""
@@ -102,8 +109,12 @@ class Part(Generic[T_co]):
     def calls_in(self, error: BaseException) -> list[tuple[str, int]]:
         """Returns the calls in an error's traceback that are in the part's own module: function and line, innermost last."""
         module = type(self.made).__module__
-        found = walk_tb(error.__traceback__)
-        return [(frame.f_code.co_name, line) for frame, line in found if frame.f_globals.get("__name__") == module]
+        return [
+            (frame.f_code.co_name, line)
+            for frame, line in walk_tb(error.__traceback__)
+            if frame.f_globals.get("__name__") == module
+            and frame.f_code.co_filename != "<string>"  # a method that `dataclass` made
+        ]
 
     def raised(self, whom: str, what: str, error: Exception) -> PartRunError:
         """Returns the error for a call of the part that raised: the line of its file where it raised, and what.
@@ -112,118 +123,30 @@ class Part(Generic[T_co]):
         who, calls = self.use, self.calls_in(error)
         if self.source is not None and calls:
             who = f"{self.source.name}, line {calls[-1][1]}: {type(self.made).__name__}"
-        if isinstance(error, ValidationError) and (found := error.errors()[0])["type"].startswith("frozen"):
-            text = f"sets self.{found['loc'][0]}: a part's attributes do not change; a law keeps numbers in `state`"
+        if isinstance(error, FrozenInstanceError):  # "cannot assign to field 'rate'"
+            name = str(error).partition("'")[2].rstrip("'")
+            text = f"sets self.{name}: a part's attributes do not change; a law keeps numbers in `state`"
         else:
-            text = f"raised {_error_text(error)}"
+            text = f"raised {error_text(error)}"
         return PartRunError(f"{who}{whom}: {what} {text}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickles the source in place of the object: the process that unpickles a plan runs the file's text itself."""
+        """Pickles the class's file with the class: the process that unpickles a plan runs the file's text itself."""
         if self.source is None:
             return Part, (self.use, self.parameters, None, self.made)
-        return _from_source, (self.use, self.parameters, self.source)
+        made: Any = self.made
+        values = {one.name: getattr(made, one.name) for one in fields(made) if one.init}
+        return _from_source, (self.use, self.parameters, self.source, pickle.dumps(values))
 
 
-def _from_source(use: str, parameters: Mapping[str, Any], source: Source) -> Part[Any]:
-    made = _class_in(source, use.rpartition(":")[2]).model_validate(dict(parameters))
-    return Part(use, parameters, source, made)
+def _from_source(use: str, parameters: Mapping[str, Any], source: Source, values: bytes) -> Part[Any]:
+    """Returns a part from its file.  `values` are those of its fields; they were checked when the scenario was read, and are
+    unpickled after the file has run, for they may be of its types."""
+    found = class_in(source, use.rpartition(":")[2])
+    return Part(use, parameters, source, found(**pickle.loads(values)))
 
 
-@dataclass(frozen=True, slots=True)
-class PartGroup:
-    """A kind of parts: its name (one of `GROUPS`), the base class of its parts, and the built-in parts by name."""
-
-    name: str
-    base: type[Plugin]
-    built_in: Mapping[str, type[Plugin]]
-    default: str = ""
-    """The built-in part of a scenario that names no part of this group; empty: the scenario must name one"""
-
-    def find(self, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
-        """Returns the class that `use` names, and its file if it is a class in a file.  Files are relative to `folder`.
-
-        Raises PartError if there is no such class, or if it is not a complete part of this group."""
-        if use in self.built_in:
-            return self.built_in[use], None
-        file, colon, name = use.rpartition(":")
-        if colon and file.endswith(".py"):
-            source = read_source(file, folder)
-            return self._checked(_class_in(source, name), use), source
-        installed = {point.name: point for point in entry_points(group=f"echelon.{self.name}")}
-        if use not in installed:
-            raise PartError(self._unknown(use, [*self.built_in, *installed]))
-        try:
-            found = installed[use].load()
-        except Exception as error:
-            raise PartError(f"the installed {installed[use].value} cannot be loaded: {_error_text(error)}") from None
-        return self._checked(found, use), None
-
-    def make(self, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
-        """Returns the part that `use` names, with these parameters.  Raises PartError if the part or a parameter is wrong."""
-        found, source = self.find(use, folder)
-        try:
-            made = found.model_validate(dict(parameters))
-        except ValidationError as error:
-            errors = error.errors(include_url=False)
-            raise PartError("wrong parameters", errors=errors, model=found) from None
-        except Exception as error:  # a part's own validator may raise anything
-            raise PartError(f"{use} refuses its parameters: {_error_text(error)}") from None
-        return Part(use, made.model_dump(mode="json", exclude_none=True), source, made)
-
-    def _checked(self, found: Any, use: str) -> type[Plugin]:
-        if not (isinstance(found, type) and issubclass(found, self.base)):
-            raise PartError(f"{use} must be a class derived from echelon.{self.base.__name__}")
-        if missing := sorted(getattr(found, "__abstractmethods__", ())):
-            raise PartError(f"{use} lacks the method {', '.join(missing)}")
-        return found
-
-    def _unknown(self, use: str, known: list[str]) -> str:
-        close = get_close_matches(use, known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        return f"{allowed(known)}{hint}"
-
-
-@dataclass(frozen=True, slots=True)
-class Registry:
-    """All groups of parts.  `echelon.sim.parts.loading` makes it with the built-in parts; planning uses it."""
-
-    groups: Mapping[str, PartGroup]
-
-    def find(self, group: str, use: str, folder: Path) -> tuple[type[Plugin], Source | None]:
-        """Returns a class of a group and its file, as `PartGroup.find`.  Raises PartError."""
-        return self.groups[group].find(use, folder)
-
-    def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
-        """Returns a part of a group with these parameters, as `PartGroup.make`.  Raises PartError."""
-        return self.groups[group].make(use, parameters, folder)
-
-    def default(self, group: str) -> Part[Any]:
-        """Returns the default part of a group, for a scenario that names none.  Raises PartError if there is no default."""
-        return self.make(group, self.groups[group].default, {}, Path())
-
-    def allowed(self, group: str) -> str:
-        """Returns the sentence of an error that says how a scenario may name a part of a group."""
-        return allowed(list(self.groups[group].built_in))
-
-
-def allowed(names: list[str]) -> str:
-    """Returns the sentence of an error that lists these names, and says that a class in a file is allowed as well."""
-    return f"must be one of {', '.join(map(repr, names))}, or 'file.py:Class'"
-
-
-def read_source(name: str, folder: Path) -> Source:
-    """Returns the text of a Python file in `folder`.  Raises PartError if it cannot be read, or is not UTF-8."""
-    path = folder / name
-    try:
-        return Source(name, path.read_bytes().decode())
-    except OSError as error:
-        raise PartError(f"{path}: {error.strerror}") from None
-    except ValueError as error:  # not UTF-8, or a path with a zero byte
-        raise PartError(f"{path}: is not UTF-8 text: {error}") from None
-
-
-def _class_in(source: Source, name: str) -> Any:
+def class_in(source: Source, name: str) -> Any:
     """Returns the attribute `name` of a file's module.  Raises PartError if the file fails, or has no such attribute."""
     module = _module(source)
     if not hasattr(module, name):
@@ -257,7 +180,7 @@ def _module(source: Source) -> ModuleType:
         del sys.modules[name]
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise PartError(f"{source.name}: {_error_text(error)}") from None
+        raise PartError(f"{source.name}: {error_text(error)}") from None
     return module
 
 
@@ -273,16 +196,16 @@ def _print(*values: object, file: Any = None, **options: Any) -> None:
         file.flush()
 
 
-def _error_text(error: BaseException) -> str:
-    if isinstance(error, PydanticUserError) and (found := _NO_TYPE.search(str(error))):
-        name, value = found.groups()
-        return f"{name} needs a type: {name}: {_type_of(value)} = {value}"
+def error_text(error: BaseException) -> str:
+    """Returns an error as text: its type and what it says."""
+    if isinstance(error, PartError):
+        return error.text
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
-def _type_of(value: str) -> str:
-    """Returns the name of the type of a value that is written in Python; "…" if it is not a number, text, list or the like."""
+def _type_of(value: Any) -> str:
+    """Returns the name of a value's type; "…" if it is not a number, text, list or the like."""
     try:
-        return type(ast.literal_eval(value)).__name__
+        return type(ast.literal_eval(repr(value))).__name__
     except (ValueError, SyntaxError):
         return "…"

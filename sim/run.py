@@ -29,7 +29,7 @@ from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import interruption
 from echelon.sim.kept_parts import keep_parts
-from echelon.sim.out_folder import SUMMARY, OutFolder
+from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
 from echelon.sim.processes.outcome import Outcome, Progress
@@ -68,7 +68,7 @@ def execute(
 
     Raises OSError if a file cannot be written; in one process also OSError or ValueError if a bus cannot be opened."""
     begun, folder = datetime.now(UTC), out.path
-    parts = keep_parts(scenario, folder)
+    parts = keep_parts(scenario, folder, (NOTE, *run_files(plan, bus=True)))
     toml = effective_toml(scenario, parts.names)
     out.note((), {EFFECTIVE: toml, **parts.files})
     write_text(folder / EFFECTIVE, toml)
@@ -169,6 +169,7 @@ def _in_process(
                     shown_s = now_s
                     progress.hear(recording.progress())
                     progress.bridge = bridge.progress()
+                    progress.hear_links(engine.link_counts())
                     recording.recorder.flush_if_due(time.monotonic_ns())
                     display.show(progress)
                 if recording.recorder.failure:

@@ -9,6 +9,7 @@ from echelon.errors import UserError
 from echelon.messages import STATE_FIELDS, Channel, Heard, Message
 from echelon.plan.layout import acceleration_of
 from echelon.plan.plan import NodePlan
+from echelon.runtime.mailbox import Act
 from echelon.runtime.turns import Turn
 from echelon.sim.engines.in_process import Engine, Row
 from echelon.sim.finished_run import Records, Run
@@ -30,7 +31,8 @@ class Simulation:
             simulation.step()
 
     Between two steps it stands at an instant `t` at which robots have said their states and leaders have said what
-    accelerations they want, and no robot has acted on them yet.  What `commands` holds then is what the robots do.
+    accelerations they want, and no robot has acted on them yet.  What `commands` holds then is what the robots do.  A command
+    that arrives before the next instant replaces it, unless you have changed it.
 
     Raises UserError for a scenario or changes that are wrong (`echelon.planning.loading`), and in each call if a part of
     yours fails.
@@ -47,6 +49,8 @@ class Simulation:
         self._engine = Engine(self.plan, self._note)
         self._time_ns = self._engine.first_ns
         self._heard: dict[int, Heard] = {}
+        self._later: dict[int, list[Act]] = {}
+        """What robots hear within the period that begins at this instant"""
         self.done = False
         """True when the scenario's duration is over"""
         self.commands: Array = np.full((len(self.plan.robots), 2), np.nan)
@@ -123,20 +127,32 @@ class Simulation:
         for row in rows:
             if row.is_due(time_ns):
                 for role, number, run, mailbox in row.stages:
-                    hears = self._meddled(role, time_ns) if row.turn is Turn.ACT else mailbox.take(number, time_ns)
-                    for message in run(time_ns, hears):
+                    if row.turn is not Turn.ACT:
+                        self._engine.act(time_ns, number, run, mailbox)
+                        continue
+                    for message in run(time_ns, self._meddled(role, time_ns)):
                         self._engine.post(message)
+                    for at_ns, heard in self._later.pop(role, ()):
+                        for message in run(at_ns, heard) if self._is_own(role) else ():
+                            self._engine.post(message)
 
     def _hear(self, time_ns: int) -> None:
         """Takes what robots that act at this instant hear, so that it can be read and overwritten."""
         for row in self._engine.timetable:
             if row.turn is Turn.ACT and row.is_due(time_ns):
                 for role, number, _, mailbox in row.stages:
-                    (command,) = mailbox.take(number, time_ns)
-                    self._heard[role] = command
-                    self.commands[role] = (
-                        np.nan if command is None else command.values[acceleration_of(self.plan.robots[role])]
-                    )
+                    (_, (command,)), *later = mailbox.acts(number, time_ns)
+                    self._heard[role], self._later[role] = command, later
+                    self.commands[role] = self._wanted(role)
+
+    def _wanted(self, robot: int) -> Array:
+        """Returns the acceleration that a robot's leader wants at this instant, (2,); NaN if there is no command."""
+        command = self._heard.get(robot)
+        return np.full(2, np.nan) if command is None else command.values[acceleration_of(self.plan.robots[robot])]
+
+    def _is_own(self, robot: int) -> bool:
+        """Returns whether `commands` still holds for a robot what its leader wants."""
+        return np.array_equal(self.commands[robot], self._wanted(robot), equal_nan=True)
 
     def _meddled(self, robot: int, time_ns: int) -> list[Heard]:
         """Returns what a robot hears, with the acceleration that `commands` holds for it."""

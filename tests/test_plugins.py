@@ -1,5 +1,6 @@
 """Parts from files: they are found and checked, their text travels to other processes, and errors name them."""
 
+import json
 import pickle
 import sys
 from pathlib import Path
@@ -55,6 +56,41 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+RICH = """
+from enum import Enum
+from typing import Annotated
+from pydantic import Field, field_validator
+from echelon import Trajectory
+from echelon.parameters import Limits, Positive
+
+class Turn(Enum):
+    LEFT = "left"
+    RIGHT = "right"
+
+class Rich(Trajectory):
+    turn: Turn = Turn.LEFT
+    sides: list[float] = [1.0, 2.0]
+    scale: Positive = 1.0
+    share: Annotated[float, Field(lt=1)] = 0.5
+    width: float = Field(2.0, ge=0)
+    name: Annotated[str, Limits(max_length=3)] = "abc"
+
+    @field_validator("width")
+    @classmethod
+    def _even(cls, width):
+        if width % 2:
+            raise ValueError("must be even")
+        return width
+
+    def __post_init__(self):
+        if self.scale < self.share:
+            raise ValueError(f"scale = {self.scale:g} must be at least share = {self.share:g}")
+
+    def at(self, t):
+        return [[0, 0]] * 3
+"""
+
+
 def untried(folder: Path, *overrides: str) -> Plan:
     """Returns a plan without a trial of its parts (echelon.sim.parts.probe)."""
     return echelon.planning.loading.load(folder / "mine.toml", overrides, REGISTRY)[1]
@@ -96,6 +132,54 @@ def test_a_pickled_plan_holds_the_text_of_its_files(folder: Path) -> None:
     assert type(again.trajectory.made) is not type(plan.trajectory.made)
     np.testing.assert_array_equal(again.trajectory.made.at(1.5), plan.trajectory.made.at(1.5))
     assert again.robots[3].model.made.share == 0.5
+
+
+def rich(**parameters: object) -> str:
+    given = ",".join(f"{key}={json.dumps(value)}" for key, value in parameters.items())
+    return f"trajectory={{use='rich.py:Rich',parameters={{{given}}}}}"
+
+
+def test_parameters_may_have_any_type_that_pydantic_checks_and_travel_as_they_are(folder: Path) -> None:
+    (folder / "rich.py").write_text(RICH)
+    one = untried(folder, rich()).trajectory
+    two = untried(folder, rich(turn="right", sides=[3], scale=4.0, width=6.0)).trajectory
+    assert (one.made.sides, one.made.width, one.parameters["turn"]) == ([1.0, 2.0], 2.0, "left")
+    assert two.parameters == {
+        "turn": "right", "sides": [3.0], "scale": 4.0, "share": 0.5, "width": 6.0, "name": "abc"
+    }  # fmt: skip
+    assert one.made.sides is not untried(folder, rich()).trajectory.made.sides  # its own list
+    again = pickle.loads(pickle.dumps(two))
+    assert again == two
+    assert vars(again.made) == vars(two.made)
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        (rich(scale=-1.0), "trajectory.parameters.scale = -1.0: must be greater than 0"),
+        (rich(scale=True), "trajectory.parameters.scale = true: must be a number"),
+        (rich(share=1.0), "trajectory.parameters.share = 1.0: must be less than 1"),
+        (rich(width=3.0), "trajectory.parameters.width: must be even"),
+        (rich(scale=0.25), "trajectory.parameters: scale = 0.25 must be at least share = 0.5"),
+        (rich(turn="up"), "trajectory.parameters.turn = 'up': must be 'left' or 'right'"),
+        (rich(name="abcd"), "trajectory.parameters.name = 'abcd': "),
+    ],
+)
+def test_parameters_are_checked_by_their_types_and_by_the_class(folder: Path, override: str, says: str) -> None:
+    (folder / "rich.py").write_text(RICH)
+    with pytest.raises(ScenarioError) as caught:
+        untried(folder, override)
+    assert says in str(caught.value)
+
+
+def test_an_inherited_parameter_needs_its_type_again(folder: Path) -> None:
+    (folder / "my_paths.py").write_text(SPIRAL + "\n\nclass Fast(Spiral):\n    rate = 0.9\n")
+    assert "my_paths.py: rate needs a type: rate: float = 0.9" in refused(folder, 'trajectory={use="my_paths.py:Fast"}')
+
+
+def test_a_type_that_pydantic_does_not_know_is_one_line(folder: Path) -> None:
+    (folder / "my_paths.py").write_text(SPIRAL.replace("rate: float = 0.2", "rate: np.ndarray = 0.2"))
+    assert "my_paths.py:Spiral: Pydantic" in refused(folder, USE_SPIRAL)
 
 
 def test_files_of_one_name_in_two_folders_are_different_modules(

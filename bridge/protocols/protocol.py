@@ -4,21 +4,24 @@ A protocol is one class.  It makes the host (which commands a robot's drives), t
 and the DBC messages, and says which identifiers and node ids the drives use.  No code outside its folder names a
 protocol, except the registry of the built-in ones (bridge.protocols.registry).  docs/add-a-protocol.md shows how to write one.
 
-All methods are pure.  Every process of a run imports the class with the plan, whether it needs the protocol or not.  So slow
-imports (cantools, host, drive) are inside the methods.
+All methods are pure.  Every process of a run imports the class with the plan, whether it needs the protocol or not.  So what
+only types need is imported for type checks alone, and all other imports (cantools, host, drive) are inside the methods.
 """
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from echelon.bridge.protocols.frame import WHEELS, Drive, Host, Master
-from echelon.bridge.protocols.observe import Observer
-from echelon.plan.can_plan import DrivePlan, EnvelopePlan, MotorPlan
 from echelon.plugins import Plugin
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
+
+    from echelon.bridge.protocols.frame import Drive, Host, Master
+    from echelon.bridge.protocols.observe import Observer
+    from echelon.plan.can_plan import DrivePlan, EnvelopePlan, MotorPlan
 
 
 class DriveProtocol(Plugin, ABC):
@@ -60,6 +63,8 @@ class DriveProtocol(Plugin, ABC):
 
     def addresses(self, drive: DrivePlan) -> dict[str, dict[str, int]]:
         """Returns the addresses of a robot's drives for display: `nodes` by wheel, or `identifiers` by kind of frame."""
+        from echelon.bridge.protocols.frame import WHEELS
+
         return {"nodes": dict(zip(WHEELS, drive.node_ids, strict=True))}
 
     # Hosts, drives, observers
@@ -83,12 +88,12 @@ class DriveProtocol(Plugin, ABC):
     # Descriptions of the frames
 
     @abstractmethod
-    def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
+    def messages(self, drive: DrivePlan, name: str) -> list[Message]:
         """Returns the DBC messages of a robot's frames.  `name` is the robot's name as a DBC identifier of up to 23 characters.
 
         Each cyclic identifier must have a message, since the load of a bus is computed from them."""
 
-    def shared_messages(self, period_ns: int, watchdog_ns: int) -> "list[Message]":
+    def shared_messages(self, period_ns: int, watchdog_ns: int) -> list[Message]:
         """Returns the DBC messages of `shared_identifiers`."""
         return []
 

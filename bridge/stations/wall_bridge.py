@@ -25,7 +25,7 @@ from echelon.bridge.stations.waiting import Mail, RunClock, drained
 from echelon.bridge.timing.bus_load import BitCount
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan, on_wall_clock
-from echelon.runtime.link import Link
+from echelon.runtime.fates import Fates
 from echelon.runtime.wire import count_refusal, encode, join
 
 FEEDBACK_SHARE: Final = 8
@@ -69,8 +69,8 @@ class WallBridge(Bridge):
         self._bits = [BitCount() for _ in plan.can.buses]
         self._logged_ns = -1 << 62
         all_roles = plan.all_roles
-        self._links = [
-            Link(link, plan.seed, all_roles[link.source].name, all_roles[link.receiver].name)
+        self._fates = [
+            Fates(link, plan.seed, all_roles[link.source].name, all_roles[link.receiver].name)
             for link in plan.links
             if link.channel is Channel.TORQUE and link.receiver == plan.bridge.index
         ]
@@ -122,10 +122,10 @@ class WallBridge(Bridge):
             if not self._plausible(now_ns, message):
                 count_refusal(self.mail.refused, "of another time")
                 continue
-            delay_ns = self._links[message.source].fate(message.sequence)
-            if delay_ns is None:
+            copies = self._fates[message.source].of(message.sequence, message.time_ns)
+            if not copies:
                 self.link_lost += 1
-            elif delay_ns == 0:
+            elif (delay_ns := min(copies)) == 0:
                 self._take(now_ns, message)
             else:
                 heappush(self._flying, (message.time_ns + delay_ns, message.source, message.sequence, message))

@@ -29,8 +29,8 @@ from typing import ClassVar
 import numpy as np
 
 from echelon.controller.laws.law import Block, Law, LinearGains, Nu
+from echelon.parameters import Positive
 from echelon.plan.plan import Array
-from echelon.scenario.values import Positive
 
 
 class Integral(Law):

@@ -46,14 +46,13 @@ and β = κ = 1 a quarter of it remains.
 
 from collections.abc import Callable
 from math import copysign
-from typing import Annotated, ClassVar, Final, Self
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from echelon.controller.laws.law import Block, Law, Nu
+from echelon.parameters import Limits, Positive
 from echelon.plan.plan import Array
-from echelon.scenario.values import Positive
 
 PRECISION: Final = 1e-12
 """Relative precision of η with look-ahead"""
@@ -66,22 +65,20 @@ class TerminalSliding(Law):
 
     uses: ClassVar[frozenset[str]] = frozenset({"lead"})
 
-    gamma: Annotated[float, Field(strict=True, gt=1, lt=2)] = 1.5
+    gamma: Annotated[float, Limits(strict=True, gt=1, lt=2)] = 1.5
     """γ, the curvature of the surface"""
     beta: Positive = 1.0
     """β, how fast the error moves to zero on the surface"""
     kappa: Positive = 1.0
     """κ, how strongly the error is pulled to the surface"""
 
-    @model_validator(mode="after")
-    def _reaches(self) -> Self:
+    def __post_init__(self) -> None:
         rho = 2 / self.gamma - 1
         least = rho**rho * (1 - rho) ** (1 - rho) * self.beta ** (2 / self.gamma) / self.gamma
         if self.kappa <= least:
             raise ValueError(
                 f"kappa = {self.kappa:g} must be greater than {least:.4g} with this gamma and beta: else no surface is reached"
             )
-        return self
 
     def nu(self, block: Block, t: float, e: Array, e_dot: Array, feed_forward: Array, state: Array) -> Array:
         """Returns ν [m/s²], (size,)."""

@@ -93,7 +93,8 @@ def describe_untreated(links: Sequence[LinkPlan]) -> str:
     def like(link: LinkPlan) -> str:
         low, high = link.delay_min_ns / 1e9, link.delay_max_ns / 1e9
         loss = [f"lose {100 * link.loss:g} % of their messages"] if link.loss else []
-        return " and ".join([*loss, *([f"have delays from {low:g} to {high:g} s"] if high > low else [])])
+        delays = [f"have delays from {low:g} to {high:g} s"] if high > low else []
+        return " and ".join([*loss, *(["have delays that vary"] if link.delays else delays)])
 
     found = Counter((link.channel.name.lower(), like(link)) for link in links)
     return ", ".join(f"{count} {channel} links {what}" for (channel, what), count in found.items())

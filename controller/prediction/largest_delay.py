@@ -1,7 +1,9 @@
 """How much later all messages of a channel may be before the run near its formation is unstable (docs/architecture.md, 2.7).
 
-The same extra delay is added to all links of the channel.  It acts in whole ticks, since messages are sent and used at
-multiples of periods only.
+All links of the channel get the same delay more, beyond what they have.  Where nodes and robots are time-driven it acts in
+ticks: a message is used at instants of its receiver, and said at instants of its source.  Where they are event-driven, whole
+ticks more shift what is used by as many messages; between the last stable tick and the next, bisection with the map finds the
+boundary, to `FINE`.
 
 *If all periods are equal*, the linear run is cut open where the messages of the channel are sent (`LinearRun.loop`).  From the
 messages that receivers get, to the messages that are sent, its transfer matrix is
@@ -35,7 +37,9 @@ from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Array, Plan
 
 TRIED: Final = 50
-"""Largest delay that is tried [ticks]"""
+"""Ticks up to which delays are tried out"""
+FINE: Final = 1e-4
+"""Of a tick: how closely the boundary is found where stages are event-driven"""
 CONFIRMED: Final = 800
 """Size of the largest map that is computed to confirm a result"""
 SLOW: Final = 1e-3
@@ -57,19 +61,45 @@ class LargestDelay:
     ticks: int | None
     """Every extra delay of 0 to `ticks` ticks is stable; None: even without extra delay the run is unstable"""
     ends: Literal["unstable", "timeout", "limit"]
-    """Why it is not more.  One tick more is unstable, or makes messages older than the timeout of a link, or was not tried"""
+    """Why it is not more: one tick more is unstable, or older than a link's timeout allows, or has not been tried out"""
+    beyond_s: float = 0.0
+    """How much more than `ticks` ticks is stable or young enough [s], where stages are event-driven"""
 
     @property
     def seconds(self) -> float | None:
-        """`ticks` in seconds."""
-        return None if self.ticks is None else self.ticks * self.tick_s
+        """The largest additional delay [s]; None if not even 0 is stable."""
+        return None if self.ticks is None else self.ticks * self.tick_s + self.beyond_s
 
 
 def largest_extra_delay(plan: Plan, channel: Channel) -> LargestDelay:
     """Returns how much later all messages of a channel may be, in a plan whose links have constant delays and lose no messages.
 
-    Raises PredictionError if no exact prediction is possible for the plan itself, and ValueError if the channel has no
-    links."""
+    Raises PredictionError if nothing exact can be said of the plan as it is, ValueError if it has no such link."""
+    found = _in_ticks(plan, channel)
+    if found.ticks is None or found.ends == "limit" or not any(one.event_driven for one in plan.formation):
+        return found
+    tick_ns = round(found.tick_s * 1e9)
+    low_ns, high_ns = found.ticks * tick_ns, (found.ticks + 1) * tick_ns
+    first_ns = low_ns
+    while high_ns - low_ns > max(1, FINE * tick_ns):
+        middle_ns = (low_ns + high_ns) // 2
+        if _bears(plan, channel, middle_ns):
+            low_ns = middle_ns
+        else:
+            high_ns = middle_ns
+    return replace(found, beyond_s=(low_ns - first_ns) * 1e-9)
+
+
+def _bears(plan: Plan, channel: Channel, extra_ns: int) -> bool:
+    """Returns whether the run is stable with all messages of a channel later, and none older than its timeout."""
+    try:
+        return spectral_radius(LinearRun(later(plan, channel, extra_ns)).map()) < 1
+    except PredictionError:
+        return False
+
+
+def _in_ticks(plan: Plan, channel: Channel) -> LargestDelay:
+    """Returns the largest additional delay in whole ticks; see `largest_extra_delay`."""
     links = ruled_links(plan, channel)
     if not links:
         raise ValueError(f"channel {channel.name.lower()}: there is no link of it")

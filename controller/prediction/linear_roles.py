@@ -14,10 +14,12 @@ from scipy.linalg import block_diag
 from echelon.controller.laws.in_tree import is_linear
 from echelon.controller.node import NodeLaw
 from echelon.controller.prediction.gains import linear_gains
+from echelon.controller.prediction.schedule import TimedStage
 from echelon.controller.transformation import node_matrix
 from echelon.messages import Channel
 from echelon.plan.layout import CENTROID, GroupStateLayout, NodeLayout, ReferenceLayout, acceleration_of
 from echelon.plan.plan import Array, NodePlan, Plan, RobotPlan
+from echelon.role import Acts, Input
 from echelon.runtime.turns import Turn, level
 
 MOTION: Final = (0, 0, 1, 1)
@@ -28,18 +30,16 @@ Said = dict[Channel, Array]
 """The messages that a stage sends, by channel; each is (numbers in the message, runs)"""
 
 
+Heard = Sequence[tuple[int, Sequence[Array]]]
+"""The acts of a stage in one of its periods: how long after the beginning of the period [ns], and what was heard"""
+
+
 @dataclass(frozen=True, slots=True)
 class LinearStage:
-    """A stage: at multiples of `period_ns`, `run` is called with the message of each of `inputs`."""
+    """A stage: `run` takes its acts in one of its periods."""
 
-    level: int
-    """Place in the order of the stages of one instant"""
-    period_ns: int
-    source: int
-    """Index of the role"""
-    inputs: tuple[tuple[int, int, Channel], ...]
-    """Source, receiver and channel of the links whose messages it uses"""
-    run: Callable[[Sequence[Array]], Said]
+    timed: TimedStage
+    run: Callable[[Heard], Said]
 
 
 def powers_of(plan: Plan, source: int, channel: Channel) -> tuple[int, ...]:
@@ -67,33 +67,44 @@ class LinearRobot:
         self.memory: Array = np.zeros((len(MOTION), 0))
         """(x, y, vx, vy)"""
         self._mine = acceleration_of(robot)
-        index, period_ns = robot.index, robot.torque_period_ns if plan.can.closed else robot.period_ns
-        T = period_ns * 1e-9
-        self._drift, self._push = np.kron([[1.0, T], [0.0, 1.0]], np.eye(2)), np.kron([[T**2 / 2], [T]], np.eye(2))
-        say = LinearStage(level(plan, Turn.SAY, 0), robot.period_ns, index, (), self._say)
-        command, act = ((robot.parent, index, Channel.COMMAND),), level(plan, Turn.ACT, 0)
+        index, period_ns = robot.index, robot.period_ns
+        command = (Input(robot.parent, Channel.COMMAND),)
+        says = ((Channel.STATE, period_ns),)
+        say = TimedStage(Turn.SAY, level(plan, Turn.SAY, 0), period_ns, index, (), Acts.IN_TURN, says)
+        at = level(plan, Turn.ACT, 0)
+        self.stages: tuple[LinearStage, ...]
         if plan.bridge is None:
-            self.stages: tuple[LinearStage, ...] = (say, LinearStage(act, period_ns, index, command, self._act))
+            acts = Acts.ON_ARRIVAL if robot.event_driven else Acts.AT_INSTANT
+            act = TimedStage(Turn.ACT, at, period_ns, index, command, acts, ())
+            self._period_ns = period_ns
+            self.stages = LinearStage(say, self._say), LinearStage(act, self._act)
         else:
-            torque, serve = ((index, plan.bridge.index, Channel.TORQUE),), level(plan, Turn.SERVE, 0)
-            ask, move = self._ask, self._move
-            self.stages = (
-                say,
-                LinearStage(act, period_ns, index, command, ask),
-                LinearStage(serve, period_ns, index, torque, move),
-            )
+            self._period_ns = h_ns = robot.torque_period_ns
+            ask = TimedStage(Turn.ACT, at, h_ns, index, command, Acts.IN_TURN, ((Channel.TORQUE, h_ns),))
+            at, torque = level(plan, Turn.SERVE, 0), (Input(index, Channel.TORQUE),)
+            serve = TimedStage(Turn.SERVE, at, h_ns, plan.bridge.index, torque, Acts.IN_TURN, ())
+            self.stages = LinearStage(say, self._say), LinearStage(ask, self._ask), LinearStage(serve, self._serve)
 
-    def _say(self, heard: Sequence[Array]) -> Said:
+    def _say(self, heard: Heard) -> Said:
         return {Channel.STATE: self.memory}
 
-    def _act(self, heard: Sequence[Array]) -> Said:
-        return self._move([heard[0][self._mine]])
+    def _act(self, heard: Heard) -> Said:
+        return self._move([(after_ns, command[self._mine]) for after_ns, (command,) in heard])
 
-    def _ask(self, heard: Sequence[Array]) -> Said:
-        return {Channel.TORQUE: heard[0][self._mine]}
+    def _ask(self, heard: Heard) -> Said:
+        ((_, (command,)),) = heard
+        return {Channel.TORQUE: command[self._mine]}
 
-    def _move(self, heard: Sequence[Array]) -> Said:
-        self.memory = self._drift @ self.memory + self._push @ heard[0]
+    def _serve(self, heard: Heard) -> Said:
+        return self._move([(after_ns, torque) for after_ns, (torque,) in heard])
+
+    def _move(self, accelerations: Sequence[tuple[int, Array]]) -> Said:
+        """Moves through a period; each acceleration holds from its instant after the beginning of the period [ns]."""
+        ends = [after_ns for after_ns, _ in accelerations[1:]] + [self._period_ns]
+        for (after_ns, a), end_ns in zip(accelerations, ends, strict=True):
+            T = (end_ns - after_ns) * 1e-9
+            position, velocity = self.memory[:2], self.memory[2:]
+            self.memory = np.vstack((position + T * velocity + T**2 / 2 * a, velocity + T * a))
         return {}
 
 
@@ -111,19 +122,32 @@ class LinearNode:
         """The integrals q of the law's integral action"""
         self._s: Array = np.zeros((0, 0))
         self._state: Array = np.zeros((0, 0))
-        index, robots = node.index, len(plan.robots)
+        robots = len(plan.robots)
         children = tuple(
-            (child, index, Channel.STATE if child < robots else Channel.GROUP_STATE) for child in node.children
+            Input(child, Channel.STATE if child < robots else Channel.GROUP_STATE) for child in node.children
         )
-        parent = () if node.parent is None else ((node.parent, index, Channel.REFERENCE),)
-        gather, steer = (level(plan, turn, node.depth) for turn in (Turn.GATHER, Turn.STEER))
-        self.stages = (
-            LinearStage(gather, node.period_ns, index, children, self._gather),
-            LinearStage(steer, node.period_ns, index, parent, self._steer),
+        parent = () if node.parent is None else (Input(node.parent, Channel.REFERENCE),)
+        up: tuple[tuple[Channel, int], ...] = ()
+        if node.parent is not None:
+            up = ((Channel.GROUP_STATE, plan.nodes[node.parent - robots].period_ns),)
+        down = [
+            (channel, node.period_ns)
+            for channel, layout in (
+                (Channel.REFERENCE, self._layout.reference),
+                (Channel.COMMAND, self._layout.command),
+            )
+            if layout is not None
+        ]
+        acts = Acts.WHEN_HEARD if node.event_driven else Acts.AT_INSTANT
+        gather, steer = (
+            TimedStage(turn, level(plan, turn, node.depth), node.period_ns, node.index, inputs, acts, tuple(says))
+            for turn, inputs, says in ((Turn.GATHER, children, up), (Turn.STEER, parent, down))
         )
+        self.stages = LinearStage(gather, self._gather), LinearStage(steer, self._steer)
 
-    def _gather(self, heard: Sequence[Array]) -> Said:
-        """Takes the children's states; returns the group's state for the parent, nothing at the root."""
+    def _gather(self, acts: Heard) -> Said:
+        """Takes the children's states; returns the group's."""
+        ((_, heard),) = acts
         self._s = s = np.vstack([values[CENTROID] for values in heard])
         own, layout = self._law.up @ s, self._layout.state
         self._state = state = np.empty((layout.size, s.shape[1]))
@@ -138,8 +162,9 @@ class LinearNode:
             state[layout.centroid_rates] = own[2:4]
         return {}
 
-    def _steer(self, heard: Sequence[Array]) -> Said:
+    def _steer(self, acts: Heard) -> Said:
         """Takes the parent's reference; returns references and commands for the children."""
+        ((_, heard),) = acts
         mine = self._layout.mine
         if mine is None:
             c, rates = np.zeros((6, self._s.shape[1])), self._state[self._layout.state.rates]

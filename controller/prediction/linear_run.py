@@ -3,9 +3,9 @@
 Near the formation, with avoidance silent and torques that do what accelerations ask, a run is linear in its errors:
 
 - a robot is a double integrator under the acceleration a that it holds: p⁺ = p + T v + T²/2 a, v⁺ = v + T a;
-- a node multiplies by the matrices of `controller.node.NodeLaw`; if the law has integral action, it stays within its bounds;
-- a link with the constant delay d, whose messages are sent with the period P, delivers message number ⌊(t - d)/P⌋ at t, as
-  `echelon.runtime.link` does.
+- a node is the matrices of `controller.node.NodeLaw`, and integral action within its bounds where the law has it;
+- with constant delays a stage acts in the long run at the same instants of each hyperperiod, and uses the same messages
+  (`controller.prediction.schedule`).
 
 All periods divide that of the root, the *hyperperiod* H.  The state x at the beginning of a hyperperiod consists of (p, v) of
 all robots, the integrals q of nodes whose law has them, and the messages on their way.  M is found by taking unit vectors of x
@@ -26,10 +26,12 @@ from scipy.sparse import csr_array
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, powers_of
+from echelon.controller.prediction.schedule import schedule
 from echelon.controller.prediction.unit_vectors import Columns, Rows
 from echelon.messages import Channel
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.punctuality import with_punctuality
 
 CHANNELS: Final = (Channel.STATE, Channel.GROUP_STATE, Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
 """The channels to which the rules in a scenario's `links` apply; links of other channels stand for shafts and buses"""
@@ -51,7 +53,7 @@ class Loop:
 
 def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
     """Returns the links that a linear map cannot describe: they lose messages, or their delays vary."""
-    return tuple(link for link in plan.links if link.loss > 0 or link.delay_min_ns != link.delay_max_ns)
+    return tuple(link for link in plan.links if not link.steady)
 
 
 def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:
@@ -62,7 +64,7 @@ def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:
             return link
         return replace(link, delay_min_ns=link.delay_min_ns + extra_ns, delay_max_ns=link.delay_max_ns + extra_ns)
 
-    return replace(plan, links=tuple(map(longer, plan.links)))
+    return replace(plan, links=tuple(with_punctuality(list(map(longer, plan.links)), plan.nodes)))
 
 
 def ruled_links(plan: Plan, channel: Channel) -> list[LinkPlan]:
@@ -92,8 +94,11 @@ class LinearRun:
         robots = [LinearRobot(plan, robot) for robot in plan.robots]
         nodes = [LinearNode(plan, node) for node in plan.nodes]
         self._roles: list[LinearRobot | LinearNode] = [*robots, *nodes]
-        self._stages = sorted((stage for role in self._roles for stage in role.stages), key=lambda stage: stage.level)
-        self._tick_ns = gcd(*(stage.period_ns for stage in self._stages))
+        self._stages = sorted(
+            (stage for role in self._roles for stage in role.stages), key=lambda stage: stage.timed.level
+        )
+        self._tick_ns = gcd(*(stage.timed.period_ns for stage in self._stages))
+        self._schedule = schedule(plan, [stage.timed for stage in self._stages])
         self._wires = self._make_wires()
         self._places: list[int] = []
         """Where in x the memory of each role begins"""
@@ -109,9 +114,9 @@ class LinearRun:
     def periods(self, channel: Channel | None = None) -> set[int]:
         """Returns the periods of all stages [ns], or of the stages that use messages of a channel."""
         return {
-            stage.period_ns
+            stage.timed.period_ns
             for stage in self._stages
-            if channel is None or any(heard is channel for _, _, heard in stage.inputs)
+            if channel is None or any(heard.channel is channel for heard in stage.timed.inputs)
         }
 
     def map(self) -> csr_array:
@@ -127,25 +132,17 @@ class LinearRun:
         return (self.hyperperiod_ns * 1e-9) ** np.array(powers, dtype=float)
 
     def _make_wires(self) -> "dict[tuple[int, Channel], _Wire]":
-        """Returns the wires of all messages that are used, by source and channel."""
-        plan, names = self.plan, [one.name for one in self.plan.all_roles]
-        links = {(link.source, link.receiver, link.channel): link for link in plan.links}
+        """Returns the wires of all that is heard, by source and channel."""
+        plan = self.plan
+        periods = {(link.source, link.channel): link.period_ns for link in plan.links}
         wires: dict[tuple[int, Channel], _Wire] = {}
-        for stage in self._stages:
-            for source, receiver, channel in stage.inputs:
-                link = links[source, receiver, channel]
-                if (source, channel) not in wires:
-                    wires[source, channel] = _Wire(link.period_ns, self._units(powers_of(plan, source, channel)))
-                wire = wires[source, channel]
-                wire.delay_ns[receiver] = link.delay_min_ns
-                for time_ns in range(0, self.hyperperiod_ns, stage.period_ns):
-                    number = wire.number(receiver, time_ns)
-                    wire.used.add(number)
-                    if (age_ns := time_ns - number * wire.period_ns) > link.timeout_ns:
-                        raise PredictionError(
-                            f"{channel.name.lower()} from {names[source]} to {names[receiver]} is {age_ns / 1e9:g} s old "
-                            f"when it would be used, more than its timeout of {link.timeout_ns / 1e9:g} s"
-                        )
+        for stage, acts in zip(self._stages, self._schedule, strict=True):
+            for act in (act for some in acts.values() for act in some):
+                for heard, number in zip(stage.timed.inputs, act.used, strict=True):
+                    at = heard.source, heard.channel
+                    if at not in wires:
+                        wires[at] = _Wire(periods[at], self._units(powers_of(plan, *at)))
+                    wires[at].used.add(number)
         return wires
 
     def _through(self, cut: Channel | None) -> Loop:
@@ -174,17 +171,21 @@ class LinearRun:
         said: dict[tuple[_Wire, int], Array] = {}
 
         for time_ns in range(0, hyperperiod_ns, self._tick_ns):
-            for stage in self._stages:
-                if time_ns % stage.period_ns:
+            for stage, acts in zip(self._stages, self._schedule, strict=True):
+                if time_ns not in acts:
                     continue
-                heard = [wires[source, channel].heard(receiver, time_ns) for source, receiver, channel in stage.inputs]
-                for channel, values in stage.run(heard).items():
-                    wire = wires[stage.source, channel]
-                    number, after = divmod(time_ns, wire.period_ns)
-                    if after == 0:
-                        said[wire, number] = values
+                inputs = [wires[heard.source, heard.channel].said for heard in stage.timed.inputs]
+                heard = [
+                    (after_ns, [said[number] for said, number in zip(inputs, used, strict=True)])
+                    for after_ns, used in acts[time_ns]
+                ]
+                values = stage.run(heard)
+                for channel, period_ns in stage.timed.says:
+                    if time_ns % period_ns == 0 and (stage.timed.member, channel) in wires:
+                        wire, number = wires[stage.timed.member, channel], time_ns // period_ns
+                        said[wire, number] = values[channel]
                         if (wire, number) not in given:
-                            wire.said[number] = values
+                            wire.said[number] = values[channel]
 
         rows = Rows(columns)
         for role, at, unit in zip(self._roles, self._places, units, strict=True):
@@ -210,10 +211,8 @@ class _Wire:
 
     def __init__(self, period_ns: int, unit: Array) -> None:
         self.period_ns, self.unit, self.size = period_ns, unit, len(unit)
-        self.delay_ns: dict[int, int] = {}
-        """Delay of the link by receiver"""
         self.used: set[int] = set()
-        """Numbers of the messages that are used in the hyperperiod"""
+        """Numbers of the messages that are used in the hyperperiod from 0 on; number 0 is said in its first period"""
         self.at = 0
         """Where in x the messages on their way begin, the oldest first"""
         self.said: dict[int, Array] = {}
@@ -221,17 +220,9 @@ class _Wire:
 
     @property
     def on_way(self) -> int:
-        """Number of messages that are sent before 0 and used at 0 or later."""
-        return max(-(-delay_ns // self.period_ns) for delay_ns in self.delay_ns.values())
-
-    def number(self, receiver: int, time_ns: int) -> int:
-        """Returns the number of the message that a receiver uses at an instant."""
-        return (time_ns - self.delay_ns[receiver]) // self.period_ns
-
-    def heard(self, receiver: int, time_ns: int) -> Array:
-        """Returns the message that a receiver uses at an instant."""
-        return self.said[self.number(receiver, time_ns)]
+        """How many messages of earlier hyperperiods are used in this one, or may be in later ones."""
+        return max(0, -min(self.used))
 
     def place(self, number: int) -> int:
-        """Returns where in x a message begins that was sent before 0."""
+        """Returns where a message of an earlier hyperperiod begins in x."""
         return self.at + (self.on_way + number) * self.size

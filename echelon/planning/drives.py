@@ -12,7 +12,7 @@ from echelon.plan.can_plan import NEVER_NS, BusPlan, CanPlan, DrivePlan, Envelop
 from echelon.plan.plan import PlanError, RobotPlan
 from echelon.planning.node_ids import Place, ask, choose_nodes
 from echelon.plugins import Part
-from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop, Event
+from echelon.scenario.can_tables import BusOff, Can, CanEvent, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop
 from echelon.scenario.values import path_matches
 
 RAW_MAX: Final = 32767
@@ -139,10 +139,12 @@ class DriveMaker:
         return names.index(name)
 
 
-def make_events(events: Iterable[Event], robots: Sequence[RobotPlan], can: CanPlan) -> tuple[EventPlan, ...]:
-    """Returns the events in the order of their instants.  Raises PlanError."""
+def make_events(events: Iterable[object], robots: Sequence[RobotPlan], can: CanPlan) -> tuple[EventPlan, ...]:
+    """Returns the events of drives and buses in the order of their instants.  Raises PlanError."""
     plans = []
     for number, event in enumerate(events):
+        if not isinstance(event, CanEvent):
+            continue
         key = f"events.{number}"
         if not can.closed:
             raise PlanError(f"{key}.kind = {event.kind!r}: needs can.path = 'closed'")

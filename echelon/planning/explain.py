@@ -3,10 +3,10 @@
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from types import UnionType
-from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, Tag
 from pydantic_core import ErrorDetails
@@ -34,10 +34,13 @@ TEXTS: Final = {
     "dict_type": "must be a table",
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
+    "dataclass_type": "must be a table",
     "missing": "missing",
 }
 """Texts for pydantic's types of errors.  `_text` makes the texts that need more than the error's context."""
 
+UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
+"""pydantic's types of the error of an unknown key: in a table, and in the parameters of a part"""
 NAME_RULE: Final = "a name is a lower-case letter, then up to 31 lower-case letters, digits, hyphens or underscores"
 PAIR_RULE: Final = "must be two numbers, [x, y]"
 
@@ -50,7 +53,7 @@ class Mistake:
     text: str
 
 
-def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[str | int, ...] = ()) -> list[Mistake]:
+def explain(errors: Sequence[ErrorDetails], root: type, above: tuple[str | int, ...] = ()) -> list[Mistake]:
     """Returns the mistakes, each once.
 
     If a key is missing and an unknown key resembles it, only the unknown key is reported, since it is probably misspelled.
@@ -58,14 +61,13 @@ def explain(errors: Sequence[ErrorDetails], root: type[BaseModel], above: tuple[
     misspelled = {
         (error["loc"][:-1], close)
         for error in errors
-        if error["type"] == "extra_forbidden"
-        and (close := close_key(str(error["loc"][-1]), _walk(error["loc"], root)[1]))
+        if error["type"] in UNKNOWN and (close := close_key(str(error["loc"][-1]), _walk(error["loc"], root)[1]))
     }
     reported = [e for e in errors if e["type"] != "missing" or (e["loc"][:-1], e["loc"][-1]) not in misspelled]
     return list(dict.fromkeys(mistake for error in reported for mistake in _mistakes(error, root, above)))
 
 
-def _mistakes(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int, ...]) -> list[Mistake]:
+def _mistakes(error: ErrorDetails, root: type, above: tuple[str | int, ...]) -> list[Mistake]:
     """Returns the mistakes of one error: several if it is a part with several wrong parameters."""
     if error["type"] != "value_error" or not isinstance(part := error["ctx"]["error"], PartError):
         return [_mistake(error, root, above)]
@@ -76,7 +78,7 @@ def _mistakes(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int
     return [Mistake(keys, f"{key_text(keys)}{shown}: {part.text}")]
 
 
-def _mistake(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int, ...]) -> Mistake:
+def _mistake(error: ErrorDetails, root: type, above: tuple[str | int, ...]) -> Mistake:
     """Returns the mistake of one error that does not come from a part."""
     kind, value, location = error["type"], error["input"], error["loc"]
     if kind.startswith("recursion"):
@@ -86,7 +88,7 @@ def _mistake(error: ErrorDetails, root: type[BaseModel], above: tuple[str | int,
         return Mistake(keys, f"{key_text(keys)}: {NAME_RULE}")
     keys, annotation = _walk(location, root)
     keys = above + keys
-    if kind == "extra_forbidden":
+    if kind in UNKNOWN:
         return Mistake(keys, f"{key_text(keys)}: {_unknown(str(keys[-1]), annotation)}")
     if kind in ("union_tag_invalid", "union_tag_not_found"):  # a table whose `kind` is wrong or missing
         keys, kinds = (*keys, "kind"), list(_members(annotation))
@@ -132,7 +134,7 @@ def _one_of(allowed: Sequence[str], value: Any = None) -> str:
 
 
 def _unknown(key: str, model: Any) -> str:
-    known = ", ".join(sorted(_bare(model).model_fields))
+    known = ", ".join(sorted(_fields(model)))
     if not known:
         return "unknown key; there are none here"
     close = close_key(key, model)
@@ -141,7 +143,7 @@ def _unknown(key: str, model: Any) -> str:
 
 def close_key(key: str, model: Any) -> str | None:
     """Returns the key of a table that most resembles an unknown key, or None."""
-    close = get_close_matches(key, sorted(_bare(model).model_fields), n=1, cutoff=0.5)
+    close = get_close_matches(key, sorted(_fields(model)), n=1, cutoff=0.5)
     return close[0] if close else None
 
 
@@ -156,16 +158,13 @@ def _walk(location: Sequence[str | int], root: Any) -> tuple[tuple[str | int, ..
     for at, part in enumerate(location, start=1):
         if members := _members(annotation):
             member = members[str(part)]
-            if at < len(location) or _is_model(member):
+            if at < len(location) or _is_model(member) or _members(member):
                 annotation = member
             continue  # a plain value: the type stays the union, so that all its members are offered
         keys.append(part)
         bare = _bare(annotation)
-        if _is_model(bare):
-            if str(part) in bare.model_fields:
-                annotation = bare.model_fields[str(part)].annotation
-        else:  # a list, a pair, or a table of tables: its last type argument is the type of its entries
-            annotation = get_args(bare)[-1]
+        # of a list, a pair, or a table of tables the last type argument is the type of its entries
+        annotation = _fields(bare).get(str(part), annotation) if _is_model(bare) else get_args(bare)[-1]
     return tuple(keys), annotation
 
 
@@ -174,8 +173,8 @@ def is_array(keys: Sequence[str], root: type[BaseModel]) -> bool:
     annotation: Any = root
     for key in keys:
         bare = _bare(annotation)
-        if _is_model(bare) and key in bare.model_fields:
-            annotation = bare.model_fields[key].annotation
+        if _is_model(bare) and key in _fields(bare):
+            annotation = _fields(bare)[key]
         elif get_origin(bare) in (list, dict):
             annotation = get_args(bare)[-1]
         else:
@@ -186,7 +185,17 @@ def is_array(keys: Sequence[str], root: type[BaseModel]) -> bool:
 
 
 def _is_model(annotation: Any) -> bool:
-    return isinstance(_bare(annotation), type) and issubclass(_bare(annotation), BaseModel)
+    bare = _bare(annotation)
+    return isinstance(bare, type) and (issubclass(bare, BaseModel) or is_dataclass(bare))
+
+
+def _fields(model: Any) -> dict[str, Any]:
+    """Returns the types of the keys of a table: a pydantic model, or a dataclass, which a part is."""
+    bare = _bare(model)
+    if issubclass(bare, BaseModel):
+        return {name: field.annotation for name, field in bare.model_fields.items()}
+    types = get_type_hints(bare)
+    return {field.name: types[field.name] for field in fields(bare)}
 
 
 def _bare(annotation: Any) -> Any:

@@ -11,11 +11,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from echelon.errors import UserError
+from echelon.part_groups import Registry
 from echelon.plan.plan import Plan
 from echelon.planning.explain import explain, is_array, key_text, short
 from echelon.planning.missing_keys import fill_missing
 from echelon.planning.plan_maker import PlanError, make_plan
-from echelon.plugins import Registry, Source
+from echelon.plugins import Source
 from echelon.scenario.part_fields import PartContext
 from echelon.scenario.tables import Scenario
 
@@ -71,7 +72,9 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
         found = [(line.split(" = ")[0].split(":")[0], line) for line in error.lines]
     except RecursionError:
         found = [("formation", "formation: groups are nested too deep")]
-    raise _scenario_error(name, [(_overridden(key, changed), text) for key, text in [*found, *missing]])
+    raise _scenario_error(
+        name, [(_overridden(key, changed), _with_name(text, table)) for key, text in [*found, *missing]]
+    )
 
 
 def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioError:
@@ -80,6 +83,15 @@ def _scenario_error(name: str, mistakes: Sequence[tuple[str, str]]) -> ScenarioE
     (where, text), *others = dict.fromkeys(mistakes)
     first = f"{name} {where}: {text}" if where else f"{name}: {text}"
     return ScenarioError(first, *(f"{where}: {text}" if where else text for where, text in others))
+
+
+def _with_name(text: str, table: Mapping[str, Any]) -> str:
+    """Returns a text about a mistake; a rule of links that has a name is called by it: `links.uplink`."""
+    links: Any = table.get("links")
+    if not (about := _LINK.match(text)) or not _holds_tables(links):
+        return text
+    name = links[int(about[1])].get("name") if int(about[1]) < len(links) else None
+    return f"links.{name}{text[about.end() :]}" if isinstance(name, str) and _NAME.fullmatch(name) else text
 
 
 def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None) -> str:
@@ -111,11 +123,17 @@ _INDEX = re.compile(r"\s*\[\s*([0-9]{1,9})\s*\](?=\s*(?:[.\[]|$))")
 """The number of an array's entry in brackets, at the end of a chunk of a key"""
 
 
+_LINK = re.compile(r"links\.([0-9]{1,9})(?![0-9A-Za-z_-])")
+"""The key of a rule of links, at the beginning of a text"""
+_NAME = re.compile(r"[a-z][a-z0-9_-]*")
+
+
 def _override(table: dict[str, Any], override: str) -> str:
     """Sets one value in a table and returns its key.  Raises OverrideError.
 
-    An override reads `law.epsilon=[0.1, 0.2]`, `links.0.delay=0.006` or `links[0].delay=0.006`.  The number may be left out
-    if the array holds only one table: `links.delay=0.006`."""
+    An override reads `law.epsilon=[0.1, 0.2]`, `links.0.delay=0.006` or `links[0].delay=0.006`.  An entry with a name may be
+    called by it: `links.uplink.delay=0.006`.  The number may be left out if the array holds only one table:
+    `links.delay=0.006`."""
     key, equals, text = override.partition("=")
     chunks = [chunk.strip() for chunk in _INDEX.sub(r".\1", key).split(".")]
     if not equals or not all(chunks):
@@ -144,19 +162,25 @@ def _override(table: dict[str, Any], override: str) -> str:
 
 
 def _numbered(table: dict[str, Any], chunks: Sequence[str]) -> list[str]:
-    """Returns a path of keys with the numbers that were left out.  Raises OverrideError if an array does not have just one
-    table."""
+    """Returns a path of keys with numbers for names of entries, and with the numbers that were left out.  Raises OverrideError
+    if neither names an entry."""
     path: list[str] = []
     at: Any = table
     for chunk in chunks:
         if not _is_number(chunk) and is_array(path, Scenario) and (at is None or _holds_tables(at)):
             entries = at or []
+            if (named := [number for number, entry in enumerate(entries) if entry.get("name") == chunk])[:1]:
+                path.append(str(named[0]))
+                at = entries[named[0]]
+                continue
             if len(entries) != 1:
                 array, rest = ".".join(path), ".".join(chunks[len(path) :])
                 have = f"{len(entries)} entries" if entries else "no entry yet"
                 last = f", …, {array}.{len(entries) - 1}.{short(rest)}" if len(entries) > 2 else ""
                 also = f" or {array}.1.{short(rest)}" if len(entries) == 2 else ""
-                raise OverrideError(f"{array} has {have}; give its number: {array}.0.{short(rest)}{also}{last}")
+                names = ", ".join(repr(entry["name"]) for entry in entries if isinstance(entry.get("name"), str))
+                call = f" or its name ({names})" if names else ""
+                raise OverrideError(f"{array} has {have}; give its number{call}: {array}.0.{short(rest)}{also}{last}")
             path.append("0")
             at = entries[0]
         path.append(chunk)

@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from echelon.errors import Mistakes
+from echelon.part_groups import Registry
 from echelon.plan.can_plan import CanPlan
+from echelon.plan.delay_tables import TRUE_CLOCK, ClockPlan
 from echelon.plan.plan import NodePlan, PlanError, RobotPlan, ShapePlan
 from echelon.planning import shapes
 from echelon.planning.drives import DriveMaker, make_can
-from echelon.plugins import Part, Registry
+from echelon.plugins import Part
 from echelon.scenario.can_tables import DriveTable
-from echelon.scenario.tables import Group, RobotTable, Scenario, Shape
+from echelon.scenario.link_tables import Clock
+from echelon.scenario.tables import EVENT_DRIVEN, Group, RobotTable, Scenario, Shape, Timing
 from echelon.scenario.values import Table
 
 ROBOT_DEFAULTS: Final[dict[str, Any]] = {
@@ -52,7 +55,7 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
         closed=can.closed,
         default_plant=registry.make("plants", DEFAULT_PLANT, {}, Path()),
     )
-    walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot)
+    walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot, scenario.timing)
     walk.check()
     return walk.drives.placed(walk.robots), tuple(walk.nodes), can
 
@@ -117,10 +120,11 @@ class _Walk:
             self._mistakes.lines.append(f"{keys[0]}{text}{same}")
         self._mistakes.check(PlanError)
 
-    def add_group(self, group: Group, place: _Place, inherited: RobotTable) -> NodePlan:
-        """Adds a group and everything below it; returns its node.  `inherited` are the values of the groups around it."""
+    def add_group(self, group: Group, place: _Place, inherited: RobotTable, timing: Timing) -> NodePlan:
+        """Adds a group and everything below it; returns its node.  `inherited` and `timing` are of the groups around it."""
         index = self._first_node + len(self.nodes) + _count_nodes(group) - 1
         first_robot = len(self.robots)
+        timing = group.timing or timing
         inherited = _overlaid(inherited, group.robot)
         period_key = "periods.acceleration" if group.period is None else f"{place.key}.period"
         period_ns = self._acceleration_ns if group.period is None else 0
@@ -139,13 +143,13 @@ class _Walk:
             children.append(len(self.robots))
             weights.append(1)
             try:
-                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns))
+                self.robots.append(self._robot(_overlaid(inherited, table), at, period_ns, timing))
             except PlanError as error:
                 for line in error.lines:
                     self._robot_mistakes.setdefault(line.removeprefix(at.key), []).append(at.key)
         for name, sub in group.groups.items():
             at = replace(below, key=f"{place.key}.groups.{name}", path=below.path + name, child_number=len(children))
-            child = self.add_group(sub, at, inherited)
+            child = self.add_group(sub, at, inherited, timing)
             children.append(child.index)
             weights.append(child.robots)
             with self._mistakes.noted():
@@ -168,15 +172,17 @@ class _Walk:
             depth=place.depth,
             period_ns=period_ns,
             shape=shape,
+            event_driven=timing == EVENT_DRIVEN,
+            clock=_clock(group.clock),
         )
         self.nodes.append(node)
         return node
 
-    def _robot(self, table: RobotTable, place: _Place, period_ns: int) -> RobotPlan:
+    def _robot(self, table: RobotTable, place: _Place, period_ns: int, timing: Timing) -> RobotPlan:
         """Returns a robot from its table, inherited values included: all that a robot needs (`planning.missing_keys`).
 
         Raises PlanError."""
-        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive"})
+        values = ROBOT_DEFAULTS | table.model_dump(exclude_none=True, exclude={"model", "drive", "clock", "timing"})
         if values["offset"] == 0:
             raise PlanError(f"{place.key}.offset = 0: must not be zero, or the wheels cannot steer the reference point")
         least = values["mass"] * values["offset"] * values["offset"]
@@ -197,8 +203,15 @@ class _Walk:
             period_ns=period_ns,
             torque_period_ns=self._torque_ns,
             model=table.model or self._default_plant,
+            event_driven=(table.timing or timing) == EVENT_DRIVEN,
+            clock=_clock(table.clock),
             **values,
         )
+
+
+def _clock(table: Clock | None) -> ClockPlan:
+    """Returns the clock of a process."""
+    return TRUE_CLOCK if table is None else ClockPlan(round((table.offset or 0.0) * 1e9), table.drift or 0.0)
 
 
 _T = TypeVar("_T", bound=Table)

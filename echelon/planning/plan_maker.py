@@ -8,13 +8,12 @@ raises PlanError with a line for each mistake: the key, the value and what is al
 from collections.abc import Sequence
 from itertools import combinations
 from math import dist
-from typing import Final
 
 import numpy as np
 
 from echelon.errors import Mistakes
-from echelon.messages import Channel
-from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan, EventPlan
+from echelon.part_groups import Registry
+from echelon.plan.can_plan import BusRolePlan, CanPlan, EventPlan
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import (
     COORDINATOR,
@@ -30,15 +29,10 @@ from echelon.plan.plan import (
 )
 from echelon.planning.blocks import fitting, make_blocks, make_coupling
 from echelon.planning.drives import make_events
+from echelon.planning.links import make_links
 from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
-from echelon.plugins import Registry
-from echelon.scenario.tables import Law, LinkRule, Scenario, Uniform
+from echelon.scenario.tables import Law, Scenario
 from echelon.scenario.values import path_matches
-
-MAX_DELAY: Final = 1e6
-"""Largest delay of a link [s]"""
-SHOWN_NAMES: Final = 12
-"""Number of members that an error lists"""
 
 
 def make_plan(scenario: Scenario, registry: Registry) -> Plan:
@@ -70,7 +64,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
                 fitting(blocks, claim.block, f"claims.{at}.block")
         coupling = make_coupling(scenario.law, blocks)
     with mistakes.noted():
-        links = _links(scenario.links, robots, nodes, bus_roles, can)
+        links = make_links(scenario.links, scenario.events, robots, nodes, bus_roles, can)
     with mistakes.noted():
         events = make_events(scenario.events, robots, can)
     mistakes.check(PlanError)
@@ -141,105 +135,6 @@ def _check_starts(robots: Sequence[RobotPlan], radius: float) -> None:
             mistakes.setdefault(key, f"{key}: {why}")
     if mistakes:
         raise PlanError(*mistakes.values())
-
-
-def _links(
-    rules: Sequence[LinkRule],
-    robots: Sequence[RobotPlan],
-    nodes: Sequence[NodePlan],
-    bus_roles: Sequence[BusRolePlan],
-    can: CanPlan,
-) -> tuple[LinkPlan, ...]:
-    """Returns all links.  Links of the tree, and from robots to the bridge, get delay and loss from the last rule that fits.
-
-    Raises PlanError if a rule fits no link."""
-    all_roles: list[RobotPlan | NodePlan | BusRolePlan] = [*robots, *nodes, *bus_roles]
-    names = [one.name for one in all_roles]
-    limits = [_delay_ns(rule, f"links.{at}.delay") for at, rule in enumerate(rules)]
-    used: set[int] = set()
-    links = []
-    for source, receiver, channel, period_ns in [*_tree_links(robots, nodes), *_torque_links(robots, bus_roles)]:
-        rule, delay_min_ns, delay_max_ns = LinkRule(), 0, 0
-        for at, (each, limit) in enumerate(zip(rules, limits, strict=True)):
-            if (
-                each.channel in ("*", channel.name.lower())
-                and path_matches(each.source, names[source])
-                and path_matches(each.receiver, names[receiver])
-            ):
-                used.add(at)
-                rule, (delay_min_ns, delay_max_ns) = each, limit
-        timeout_ns = NEVER_NS
-        if (rule.policy or ("hold_then_stop" if can.closed else "hold")) == "hold_then_stop":
-            # A message that comes once per period may be a whole period old; so the default is at least two periods.
-            wanted = can.watchdog_ns if rule.timeout is None else round(rule.timeout * 1e9)
-            timeout_ns = max(wanted, 2 * period_ns) if rule.timeout is None else wanted
-        links.append(LinkPlan(source, receiver, channel, period_ns, delay_min_ns, delay_max_ns, rule.loss, timeout_ns))
-    unused = [_why_unused(rule, f"links.{at}", names, can.closed) for at, rule in enumerate(rules) if at not in used]
-    if unused:
-        raise PlanError(*unused)
-    return (*links, *_shaft_links(robots, bus_roles, can))
-
-
-def _torque_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan]) -> list[tuple[int, int, Channel, int]]:
-    """Returns source, receiver, channel and period [ns] of the links from robots to the bridge, which carry torques.  They can
-    have delay and loss."""
-    return [
-        (robot.index, bridge.index, Channel.TORQUE, bridge.period_ns) for bridge in bus_roles[:1] for robot in robots
-    ]
-
-
-def _shaft_links(robots: Sequence[RobotPlan], bus_roles: Sequence[BusRolePlan], can: CanPlan) -> list[LinkPlan]:
-    """Returns the links that do not stand for a network, but for shafts and for the bus.  They have no delay and no loss; the
-    delay of the bus is in `bridge.timing.arbitration`."""
-    links: list[LinkPlan] = []
-    if not can.closed:
-        return links
-    bridge, *drives = bus_roles
-    period_ns, first_ns = bridge.period_ns, bridge.first_ns
-    # A robot that gets no torques from the bridge for this time uses none: by then its drives have stopped.
-    timeout_ns = max(can.watchdog_ns, 2 * period_ns)
-    links += [LinkPlan(bridge.index, robot.index, Channel.WHEELS, period_ns, timeout_ns=timeout_ns) for robot in robots]
-    for each in drives:
-        links.append(LinkPlan(bridge.index, each.index, Channel.FRAMES, period_ns, first_ns=first_ns))
-        links.append(LinkPlan(each.index, bridge.index, Channel.FRAMES, period_ns, first_ns=first_ns))
-        links += [LinkPlan(robot.index, each.index, Channel.TORQUE, period_ns) for robot in robots]
-    return links
-
-
-def _tree_links(robots: Sequence[RobotPlan], nodes: Sequence[NodePlan]) -> list[tuple[int, int, Channel, int]]:
-    """Returns source, receiver, channel and period [ns] of every link of the tree, sorted by receiver, channel and source."""
-    links = []
-    for node in nodes:
-        for child in node.children:
-            is_node = child >= len(robots)
-            links.append((child, node.index, Channel.GROUP_STATE if is_node else Channel.STATE, node.period_ns))
-            links.append((node.index, child, Channel.REFERENCE if is_node else Channel.COMMAND, node.period_ns))
-    return sorted(links, key=lambda link: (link[1], link[2], link[0]))
-
-
-def _delay_ns(rule: LinkRule, key: str) -> tuple[int, int]:
-    """Returns the bounds of a rule's delay, to the nearest nanosecond.  Raises PlanError if it is too large."""
-    if isinstance(rule.delay, Uniform):
-        low, high, key = rule.delay.min, rule.delay.max, f"{key}.max"
-    else:
-        low = high = rule.delay
-    if high > MAX_DELAY:
-        raise PlanError(f"{key} = {high}: must be at most {MAX_DELAY:g}")
-    return round(low * 1e9), round(high * 1e9)
-
-
-def _why_unused(rule: LinkRule, key: str, names: Sequence[str], closed: bool) -> str:
-    """Returns the text that says why a rule fits no link."""
-    for end, pattern in (("source", rule.source), ("receiver", rule.receiver)):
-        if not any(path_matches(pattern, name) for name in names):
-            shown = ", ".join(reversed(names[-SHOWN_NAMES:]))
-            more = f", and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
-            return f"{key}.{end} = {pattern!r}: fits no member; there are {shown}{more}"
-    return (
-        f"{key}: no link goes from {rule.source!r} to {rule.receiver!r} on channel {rule.channel!r}; links go from a "
-        "node's child to it on 'state' or 'group_state', and back on 'command' or 'reference'"
-        + (", and from a robot to 'bridge' on 'torque'" if closed else "")
-    )
 
 
 __all__ = ["COORDINATOR", "MAX_ROBOTS", "PlanError", "make_plan", "path_matches"]

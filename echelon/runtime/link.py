@@ -1,49 +1,39 @@
-"""The link model: which message a receiver uses at a given instant (docs/architecture.md, 4.1 and 4.2).
+"""The link: when each message arrives at its receiver, and which one is in use (docs/architecture.md, 4.1 and 4.2).
 
-Every triple (source, receiver, channel) has one link, applied at the receiver.  Whether message number k is lost, and how
-long it takes, is a pure function of (scenario seed, link, k).  So the same messages are lost in every engine, at every speed
-and in every start order.  The draws come from Philox 4x64, a counter-based generator: the key stands for the link, the
-counter for the message, so any draw can be made without the draws before it.
+Every triple (source, receiver, channel) has one link, applied at the receiver.  What becomes of a message is told by
+`echelon.runtime.fates`.  A message arrives its delay after the instant at which it was sent, which is the time in its header.
+The newest message that has arrived is *in use*; a message that was overtaken arrives, but changes nothing.
 
-A receiver uses a message at its first instant at or after the arrival.  The newest message that has arrived is *in use*; a
-message that was overtaken arrives, but changes nothing.  On an *ideal* link, without delay and loss, the newest message that
-was sent is in use, and nothing is drawn.
+Message number k is due at the *nominal* instant first + k × period.  A sender that waits for its own inputs sends it later,
+but always before number k + 1 is due (docs/architecture.md, 4.6).  So a receiver knows without the message that it cannot
+arrive before its nominal instant plus its delay.  This look-ahead lets a lockstep run on while messages are on their way.
+
+On a *prompt* link, which is ideal and whose sender always sends at nominal instants, a message is in use from its nominal
+instant on, and nothing is drawn.
 """
 
-import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Final
 
-import numpy as np
-from numpy.random import Philox
-
-from echelon.messages import Channel, Values
+from echelon.messages import Channel, Message
 from echelon.plan.plan import LinkPlan
+from echelon.runtime.ages import AgeCounts
+from echelon.runtime.fates import Copies, Fates
 
-_BLOCK: Final = 512
-"""Messages per block of draws.  A message takes two 64-bit words; each count of the Philox counter gives four words."""
-
-
-def link_key(seed: int, source: str, receiver: str, channel: Channel) -> int:
-    """Returns the 128-bit Philox key of a link in a scenario."""
-    name = f"{seed}|{source}|{receiver}|{channel.name}".encode()
-    return int.from_bytes(hashlib.blake2b(name, digest_size=16).digest(), "little")
-
-
-def draws(key: int, block: int) -> Values:
-    """Returns the draws of a block, uniform in [0, 1), shape (_BLOCK, 2): for each message its loss and its delay."""
-    words = Philox(key=key, counter=block * (_BLOCK // 2)).random_raw(2 * _BLOCK)
-    uniform: Values = np.multiply(words >> np.uint64(11), 2.0**-53)
-    return uniform.reshape(_BLOCK, 2)
+PERCENTILES: Final = (0.5, 0.95, 0.99)
+"""The shares of uses whose largest age is told"""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkCounts:
     """Counts of a link's messages; sent = delivered + lost + in_flight.
 
-    `used` counts uses.  `held` counts the uses in which the message was older than the instant and had been used before.
-    `age_mean_ns` and `age_max_ns` are the mean and the largest age of the message in use, over all uses."""
+    A message is delivered when its first copy arrives.  `duplicates` counts the second copies that have arrived.  `used` counts
+    uses.  `held` counts the uses in which the message was older than the instant and had been used before.  The ages are those
+    of the message in use, over all uses: mean, largest, and the ages that half, 95 % and 99 % of the uses do not exceed
+    (echelon.runtime.ages)."""
 
     source: int
     receiver: int
@@ -56,85 +46,165 @@ class LinkCounts:
     held: int
     age_mean_ns: float
     age_max_ns: int
+    age_p50_ns: int = 0
+    age_p95_ns: int = 0
+    age_p99_ns: int = 0
+    duplicates: int = 0
 
 
 class Link:
-    """One directed link with its state.  `newest` must be called with ascending instants."""
+    """One directed link with its state.  Instants must be given in ascending order; `latest` is the number last in use."""
 
     __slots__ = (
         "_age_max",
         "_age_sum",
-        "_block",
-        "_block_number",
+        "_aged",
+        "_ages",
+        "_copies",
         "_delivered",
-        "_due_ns",
+        "_duplicates",
+        "_expected",
+        "_fates",
         "_first_ns",
         "_flying",
         "_held",
-        "_ideal",
-        "_key",
         "_last",
+        "_latest_ns",
         "_lost",
-        "_newest",
+        "_open",
         "_period_ns",
         "_sent",
         "_used",
+        "latest",
         "plan",
     )
 
     def __init__(self, plan: LinkPlan, seed: int, source: str, receiver: str) -> None:
         self.plan = plan
-        self._key = link_key(seed, source, receiver, plan.channel)
-        self._ideal = plan.ideal
+        self._fates = Fates(plan, seed, source, receiver)
         self._first_ns, self._period_ns = plan.first_ns, plan.period_ns
-        self._block: list[list[float]] = []
-        self._block_number = -1
-        self._due_ns = plan.first_ns  # when the next message is sent
-        self._sent = self._delivered = self._lost = self._used = self._held = 0
-        self._newest = self._last = -1
+        self._latest_ns = plan.first_ns
+        """The latest arrival so far, of first copies"""
+        self._sent = self._delivered = self._duplicates = self._lost = self._used = self._held = 0
+        self.latest = self._last = self._expected = -1
+        self._open: list[tuple[int, int]] = []
+        """Messages that are due, not lost, and not in `_flying` yet, by number: number and earliest possible arrival"""
         self._flying: list[tuple[int, int]] = []
-        self._age_sum = self._age_max = 0
+        """Messages on their way, as a heap: instant of arrival and number"""
+        self._copies: list[int] = []
+        """Arrivals of second copies, as a heap"""
+        self._age_sum = self._age_max = self._aged = 0
+        self._ages = AgeCounts()
+
+    def due(self, time_ns: int) -> int:
+        """Returns the number of the last message that is due at `time_ns`, or a negative number before the first one."""
+        return (time_ns - self._first_ns) // self._period_ns
 
     def sent_ns(self, sequence: int) -> int:
-        """Returns the instant at which message number `sequence` is sent [ns]."""
+        """Returns the nominal instant of message number `sequence` [ns]: it is sent then, or later."""
         return self._first_ns + sequence * self._period_ns
 
-    def fate(self, sequence: int) -> int | None:
-        """Returns the delay [ns] of message number `sequence`, or None if it is lost."""
-        plan = self.plan
-        if self._ideal:
-            return 0
-        number, at = divmod(sequence, _BLOCK)
-        if number != self._block_number:
-            self._block, self._block_number = draws(self._key, number).tolist(), number
-        loss, delay = self._block[at]
-        if loss < plan.loss:
-            return None
-        return plan.delay_min_ns + round(delay * (plan.delay_max_ns - plan.delay_min_ns))
+    def is_lost(self, sequence: int) -> bool:
+        """Returns whether message number `sequence` is lost, as far as that can be told without its instant of sending."""
+        return not self._known(sequence)
 
-    def arrived(self, sequence: int, time_ns: int) -> bool:
-        """True if message number `sequence` is not lost and has arrived by `time_ns`."""
-        delay = self.fate(sequence)
-        return delay is not None and self.sent_ns(sequence) + delay <= time_ns
+    def _known(self, sequence: int) -> Copies:
+        """Returns the delays of the copies of a message, as far as they can be told without its instant of sending."""
+        if self.plan.punctual:
+            return self._fates.of(sequence, self.sent_ns(sequence))
+        return self._fates.drawn(sequence)
+
+    def take_up(self, time_ns: int, until_ns: int, came: dict[int, Message], in_use: int) -> bool:
+        """Takes up the messages that are due at `time_ns` and may arrive by `until_ns`; returns True if none of them is
+        missing.
+
+        `came` has the messages that have come, by number, from number `in_use` + 1 on.  Those that a blackout takes away are
+        removed from it."""
+        self._open_due(time_ns)
+        if not self._open:
+            return True
+        complete, fifo = True, self.plan.fifo
+        still_open: list[tuple[int, int]] = []
+        for at, (number, earliest_ns) in enumerate(self._open):
+            if fifo and still_open:  # it cannot arrive before those that were sent before it
+                still_open += self._open[at:]
+                break
+            if earliest_ns > until_ns:
+                still_open.append((number, earliest_ns))
+            elif number <= in_use:  # it was overtaken, and changes nothing
+                heappush(self._flying, (earliest_ns, number))
+            elif (message := came.get(number)) is None:
+                complete = False
+                still_open.append((number, earliest_ns))
+            elif not self._depart(message):
+                self._lost += 1
+                del came[number]
+        self._open = still_open
+        return complete
+
+    def _open_due(self, time_ns: int) -> None:
+        """Draws the fates of the messages that are due at `time_ns`."""
+        last = (time_ns - self._first_ns) // self._period_ns
+        while self._sent <= last:
+            copies = self._known(self._sent)
+            if copies:
+                self._open.append((self._sent, self.sent_ns(self._sent) + min(copies)))
+            else:
+                self._lost += 1
+            self._sent += 1
+
+    def _depart(self, message: Message, received_ns: int | None = None) -> bool:
+        """Puts a message on its way; returns False if it is lost.  It arrives at `received_ns` at the earliest."""
+        sent_ns = message.time_ns
+        arrivals: Sequence[int] = [sent_ns + delay for delay in self._fates.of(message.sequence, sent_ns)]
+        if not arrivals:
+            return False
+        if len(arrivals) > 1:
+            arrivals = sorted(arrivals)
+        if received_ns is not None:
+            arrivals = [max(received_ns, arrival) for arrival in arrivals]
+        if self.plan.fifo:
+            arrivals = [max(self._latest_ns, arrival) for arrival in arrivals]
+            self._latest_ns = arrivals[0]
+        heappush(self._flying, (arrivals[0], message.sequence))
+        for arrival in arrivals[1:]:
+            heappush(self._copies, arrival)
+        return True
+
+    def expected(self, time_ns: int) -> int:
+        """Returns the number of the newest message that would have arrived by `time_ns` if all were sent when they are due."""
+        self._open_due(time_ns)
+        if self._open:
+            still_open = []
+            for number, earliest_ns in self._open:
+                if earliest_ns > time_ns:
+                    still_open.append((number, earliest_ns))
+                elif number > self._expected:
+                    self._expected = number
+            self._open = still_open
+        return self._expected
+
+    def receive(self, message: Message, time_ns: int) -> bool:
+        """Takes a message that comes at `time_ns` of a wall clock: it arrives then, or after the delay of its link.  Returns
+        False if it is lost."""
+        return self._depart(message, time_ns)
 
     def newest(self, time_ns: int) -> int:
-        """Returns the number of the message in use at `time_ns`, or -1 if none has arrived."""
-        if self._ideal:
-            self._newest = newest = (time_ns - self._first_ns) // self._period_ns
-            return newest
-        while self._due_ns <= time_ns:
-            delay = self.fate(self._sent)
-            if delay is None:
-                self._lost += 1
-            else:
-                heappush(self._flying, (self._due_ns + delay, self._sent))
-            self._sent += 1
-            self._due_ns += self._period_ns
-        while self._flying and self._flying[0][0] <= time_ns:
-            _, sequence = heappop(self._flying)
+        """Returns the number of the message in use at `time_ns`, or -1 if none has arrived, of those that were taken up."""
+        flying, copies = self._flying, self._copies
+        while flying and flying[0][0] <= time_ns:
+            _, sequence = heappop(flying)
             self._delivered += 1
-            self._newest = max(self._newest, sequence)
-        return self._newest
+            if sequence > self.latest:
+                self.latest = sequence
+        while copies and copies[0] <= time_ns:
+            heappop(copies)
+            self._duplicates += 1
+        return self.latest
+
+    def next_arrival(self, than: int) -> int | None:
+        """Returns the first instant at which a message arrives that is newer than number `than`, of those on their way."""
+        return min((arrives_ns for arrives_ns, number in self._flying if number > than), default=None)
 
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
         """Counts a use at `time_ns` of message number `sequence`, which was sent at `sent_ns`."""
@@ -143,15 +213,18 @@ class Link:
             age = time_ns - sent_ns
             self._held += sequence == self._last
             self._age_sum += age
+            self._aged += 1
+            self._ages.note(age)
             if age > self._age_max:
                 self._age_max = age
         self._last = sequence
 
     def counts(self) -> LinkCounts:
-        """Returns the counts up to the last instant for which `newest` was called."""
+        """Returns the counts up to the last instant for which a number was asked."""
         sent, delivered = self._sent, self._delivered
-        if self._ideal:
-            sent = delivered = self._newest + 1
+        if self.plan.prompt:
+            sent = delivered = self.latest + 1
+        p50, p95, p99 = self._ages.percentiles(PERCENTILES, self._used - self._aged)
         return LinkCounts(
             self.plan.source,
             self.plan.receiver,
@@ -159,9 +232,13 @@ class Link:
             sent,
             delivered,
             self._lost,
-            len(self._flying),
+            max(0, sent - delivered - self._lost),
             self._used,
             self._held,
             self._age_sum / self._used if self._used else 0.0,
             self._age_max,
+            min(p50, self._age_max),
+            min(p95, self._age_max),
+            min(p99, self._age_max),
+            self._duplicates,
         )

@@ -1,26 +1,49 @@
-"""The mailbox: takes messages in any order, and hands each stage of a role the messages in use at its instant.
+"""The mailbox: takes messages in any order, and says when each stage of a role acts, and with which messages
+(docs/architecture.md, 3.3 and 4.6).
 
-At time t a stage needs from each input the message that the link says is in use at t.  The link knows its number without
-having seen the message.  So the mailbox knows which messages are still missing, and a stage gets the same messages whatever
-the order, the speed and the process in which they came.  This makes the lockstep (docs/architecture.md, 3.3).
+A stage is *due* at each multiple of its period, its nominal instant.  When it acts depends on its `Acts`:
 
-A message older than its link's timeout (policy `hold_then_stop`) is not used: the stage gets None.
+    Acts         in virtual time                                             on a wall clock
+    -----------  ----------------------------------------------------------  -----------------------------------------------
+    IN_TURN      at the nominal instant, with what has arrived               when no message that should have arrived is
+                                                                             missing, at the latest at its turn's deadline
+    AT_INSTANT   at the nominal instant, with what has arrived               the same
+    WHEN_HEARD   once in its period: at the first instant at which every     the same
+                 input has something newer than at the last act, at the
+                 latest in the last nanosecond of the period
+    ON_ARRIVAL   at the nominal instant, and again at each instant of its    the same
+                 period at which something newer arrives, or at which what
+                 is in use becomes too old
+
+An input of WHEN_HEARD is not waited for if no message is due on it that is newer than the one used last.  Only messages that
+are due by the nominal instant count for an act.  So messages are exchanged as if there were no delays, and no stage waits for
+another in a circle.  A role's stages act in their order: none acts before the stage before it has acted.
+
+In virtual time the link knows from the number of a message whether it is lost and how long it takes.  So the mailbox knows
+which messages are still missing, and a stage gets the same messages at the same instants whatever the order, the speed and the
+process in which they came.  This makes the lockstep.
+
+A message older than its link's timeout is not used: the stage gets None (policy `hold_then_stop`) or zeros (policy `zero`).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import gcd
 from typing import Final
 
+import numpy as np
+
 from echelon.messages import Heard, Message
+from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import LinkPlan, Plan
-from echelon.role import Input, Role
+from echelon.role import Acts, Input, Role, Stage
 from echelon.runtime.link import Link, LinkCounts
 
 MAX_AHEAD: Final = 32
 """Number of periods by which a role in a lockstep may be ahead of any of its sources.  On a link with delay or loss a role
 needs no new messages for a while; without this limit it would run far ahead, and its messages would pile up at its sources."""
-SLACK: Final = 4 * MAX_AHEAD
-"""Number of messages that an input holds beyond those in flight before it removes messages that its link loses."""
+
+Act = tuple[int, list[Heard]]
+"""The instant of an act [ns], and the messages in use then, one for each input of the stage"""
 
 
 @dataclass(slots=True)
@@ -29,24 +52,50 @@ class _Slot:
 
     link: Link
     plan: LinkPlan
-    capacity: int
-    """If `newer` holds more messages than this, some of them are lost ones, and these are removed"""
+    prompt: bool
+    first_ns: int
+    period_ns: int
+    timeout_ns: int
+    size: int | None
+    """As in `plan`; they stand here because they are read at every message"""
     ahead_ns: int | None
     """How far the role may be ahead of the newest message that has come, even if the link loses that message.  None: no limit;
-    so on an ideal link, where the role waits for every message anyway"""
+    so on a prompt link, where the role waits for every message anyway"""
     current: Message | None = None
     """The message in use"""
     in_use: int = -1
     """The number of `current`"""
     newer: dict[int, Message] = field(default_factory=dict)
-    """Messages that have come with a number above `in_use`, by number"""
+    """Messages that have come with a number above `in_use`, by number, without those that the link loses"""
     newest: int = -1
     """The largest number of a message that has come"""
 
+    def hear(self, time_ns: int) -> Heard:
+        """Takes the newest message that has arrived, if it is newer than the one in use; returns the message in use."""
+        newer, link = self.newer, self.link
+        if self.prompt:  # as `Link.newest`, without the call
+            link.latest = number = (time_ns - self.first_ns) // self.period_ns
+        else:
+            number = link.newest(time_ns)
+        if newer and number > self.in_use:
+            message = newer.pop(number, None)
+            if message is not None:
+                if newer:  # forget the messages that this one overtakes
+                    for overtaken in range(self.in_use + 1, number):
+                        newer.pop(overtaken, None)
+                self.current, self.in_use = message, number
+        current = self.current
+        if current is None or not current.values.size:
+            return None
+        if self.timeout_ns != NEVER_NS and self.plan.read_age_ns(time_ns, current.time_ns) > self.timeout_ns:
+            return current._replace(values=np.zeros(current.values.size)) if self.plan.policy == "zero" else None
+        link.note_use(time_ns, current.sequence, current.time_ns)
+        return current
+
 
 class Mailbox:
-    """All inputs of one role.  With `paced`, a link also counts as missing while the role is `MAX_AHEAD` periods ahead of its
-    source."""
+    """All inputs of one role in virtual time.  With `paced`, a link also counts as missing while the role is `MAX_AHEAD`
+    periods ahead of its source."""
 
     def __init__(self, role: Role, plan: Plan, *, paced: bool = False) -> None:
         names = [one.name for one in plan.all_roles]
@@ -55,80 +104,170 @@ class Mailbox:
             (link.channel, link.source): _Slot(
                 Link(link, plan.seed, names[link.source], names[role.index]),
                 link,
-                2 * (link.delay_max_ns // link.period_ns) + SLACK,
+                link.prompt,
+                link.first_ns,
+                link.period_ns,
+                link.timeout_ns,
+                link.size,
                 max(MAX_AHEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
-                if paced and not link.ideal
+                if paced and not link.prompt
                 else None,
             )
             for link in plan.links_into(role.index)
         }
+        self._stages = role.stages
+        self._end_ns = plan.duration_ns
         self._stage_slots = [[self._slot(slot_input) for slot_input in stage.inputs] for stage in role.stages]
+        heard_at_once = [all(slot.prompt for slot in slots) for slots in self._stage_slots]
+        self.prompt = [all(heard_at_once[: number + 1]) for number in range(len(heard_at_once))]
+        """For each stage, whether its inputs and those of the stages before it are all on prompt links.  Then it acts at its
+        nominal instants"""
+        self._acted_ns = -1 << 62
+        """Instant of the role's last act"""
         self.unexpected = 0
-        """How many messages came that belong to no link of this role."""
+        """How many messages came that belong to no link of this role"""
         self.misshapen = 0
-        """How many messages came with a wrong number of values for their link."""
+        """How many messages came with a wrong number of values for their link"""
 
     def _slot(self, slot_input: Input) -> _Slot:
         return self._slots[slot_input.channel, slot_input.source]
 
     def deliver(self, message: Message) -> None:
         """Takes a message; the order does not matter.  Messages of no link and of a wrong size are counted and dropped."""
+        if (slot := self._place(message)) is not None:
+            slot.newer[message.sequence] = message
+
+    def _place(self, message: Message) -> _Slot | None:
+        """Returns the input that a message is for; None if it is of no use: of no link, of a wrong size, old, or lost."""
         slot = self._slots.get((message.channel, message.source))
         if slot is None:
             self.unexpected += 1
-        elif message.values.size != slot.plan.size and message.values.size and slot.plan.size is not None:
+            return None
+        number = message.sequence
+        if message.values.size != slot.size and message.values.size and slot.size is not None:
             self.misshapen += 1
-        elif message.sequence > slot.in_use:
-            slot.newer[message.sequence] = message
-            if message.sequence > slot.newest:
-                slot.newest = message.sequence
+            return None
+        if number > slot.newest:
+            slot.newest = number
+        if number <= slot.in_use or (not slot.prompt and slot.link.is_lost(number)):
+            return None
+        return slot
 
     def missing(self, stage: int, time_ns: int) -> list[Link]:
-        """Returns the links whose message in use at `time_ns` has not come; the list is empty if the stage can run."""
+        """Returns the links that miss a message which the stage needs for its period from `time_ns` on; the list is empty if
+        the stage can run."""
         waiting = []
+        until_ns = self._last_ns(self._stages[stage], time_ns)
         for slot in self._stage_slots[stage]:
             link = slot.link
-            number = link.newest(time_ns)
-            if (number > slot.in_use and number not in slot.newer) or (
+            if slot.prompt:
+                number = (time_ns - slot.first_ns) // slot.period_ns
+                if number > slot.in_use and number not in slot.newer:
+                    waiting.append(link)
+            elif not link.take_up(time_ns, until_ns, slot.newer, slot.in_use) or (
                 slot.ahead_ns is not None and link.sent_ns(slot.newest) < time_ns - slot.ahead_ns
             ):
-                waiting.append(link)
+                waiting.append(slot.link)
         return waiting
 
+    def acts(self, stage: int, time_ns: int) -> list[Act]:
+        """Returns the acts of a stage in its period from `time_ns` on.  In a lockstep no message is missing when this is
+        called."""
+        if self.prompt[stage]:
+            return [(time_ns, self.take(stage, time_ns))]
+        of, slots = self._stages[stage], self._stage_slots[stage]
+        last_ns = self._last_ns(of, time_ns)
+        for slot in slots:
+            if not slot.prompt:
+                slot.link.take_up(time_ns, last_ns, slot.newer, slot.in_use)
+        at_ns = max(time_ns, self._acted_ns)
+        if of.acts is Acts.WHEN_HEARD:
+            for slot in slots:
+                at_ns = max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns))
+            at_ns = min(at_ns, last_ns)
+        acts = [(at_ns, self.take(stage, at_ns))]
+        if of.acts is Acts.ON_ARRIVAL:
+            while (at_ns := self.next_change(stage, at_ns)) <= last_ns:
+                acts.append((at_ns, self.take(stage, at_ns)))
+        self._acted_ns = acts[-1][0]
+        return acts
+
+    def _last_ns(self, stage: Stage, time_ns: int) -> int:
+        """Returns the last instant at which a stage may act that is due at `time_ns`: none acts after the end of the run."""
+        if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT):
+            return time_ns
+        return max(time_ns, min(time_ns + stage.period_ns - 1, self._end_ns))
+
     def take(self, stage: int, time_ns: int) -> list[Heard]:
-        """Returns the messages in use at `time_ns`, one for each input of the stage; None where no message is in use.
+        """Returns the messages in use at `time_ns`, one for each input of the stage; None where no message is in use."""
+        return [slot.hear(time_ns) for slot in self._stage_slots[stage]]
 
-        In a lockstep no message is missing when this is called.  On a wall clock one may be missing; then the newest message
-        that has come takes its place, unless it is older than the timeout of the link.
-        """
-        heard: list[Heard] = []
-        for slot in self._stage_slots[stage]:
-            link, newer = slot.link, slot.newer
-            number = link.newest(time_ns)
-            if newer:
-                if number not in newer and number > slot.in_use:
-                    number = self._newest_come(slot, time_ns)
-                message = newer.pop(number, None)
-                if message is not None:
-                    if newer:  # forget the messages that this one overtakes
-                        for overtaken in range(slot.in_use + 1, number):
-                            newer.pop(overtaken, None)
-                    slot.current, slot.in_use = message, number
-                elif len(newer) > slot.capacity:
-                    slot.newer = {each: newer[each] for each in newer if link.fate(each) is not None}
-            current = slot.current
-            if current is None or not current.values.size or time_ns - current.time_ns > slot.plan.timeout_ns:
-                heard.append(None)
-            else:
-                link.note_use(time_ns, current.sequence, current.time_ns)
-                heard.append(current)
-        return heard
-
-    @staticmethod
-    def _newest_come(slot: _Slot, time_ns: int) -> int:
-        """Returns the number of the newest message that has come and has arrived by the rules of its link, or -1."""
-        return max((number for number in slot.newer if slot.link.arrived(number, time_ns)), default=-1)
+    def next_change(self, stage: int, time_ns: int) -> int:
+        """Returns the first instant after `time_ns` at which a stage hears something newer, or at which a message in use
+        becomes too old; `NEVER_NS` if there is none."""
+        return min((_change_ns(slot, time_ns) for slot in self._stage_slots[stage]), default=NEVER_NS)
 
     def counts(self) -> list[LinkCounts]:
         """Returns the counts of every link into this role."""
         return [slot.link.counts() for slot in self._slots.values()]
+
+
+class WallMailbox(Mailbox):
+    """All inputs of one role on a wall clock.  Instants are run time, and a message arrives when it really comes, or later if
+    the scenario gives its link a delay."""
+
+    def __init__(self, role: Role, plan: Plan) -> None:
+        super().__init__(role, replace(plan, links=tuple(replace(link, punctual=False) for link in plan.links)))
+
+    def receive(self, message: Message, time_ns: int) -> None:
+        """Takes a message that comes at `time_ns`.  Messages of no link and of a wrong size are counted and dropped."""
+        slot = self._place(message)
+        if slot is not None and message.sequence not in slot.newer and slot.link.receive(message, time_ns):
+            slot.newer[message.sequence] = message
+
+    def ready(self, stage: int, time_ns: int, deadline_ns: int) -> tuple[int, bool]:
+        """Returns when a stage that is due at `time_ns` acts if nothing further comes, and whether it then misses a message.
+
+        `deadline_ns` is the deadline of its turn, for a stage that acts in turn."""
+        of, slots = self._stages[stage], self._stage_slots[stage]
+        expected = [slot.link.expected(time_ns) for slot in slots]
+        if of.acts is Acts.IN_TURN:
+            missed = any(
+                number > slot.in_use and number not in slot.newer for slot, number in zip(slots, expected, strict=True)
+            )
+            return (deadline_ns, True) if missed else (time_ns, False)
+        if of.acts is not Acts.WHEN_HEARD:
+            return time_ns, False
+        at_ns, last_ns = time_ns, self._last_ns(of, time_ns)
+        for slot in slots:
+            at_ns = max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns))
+        return min(at_ns, last_ns), at_ns >= last_ns and self.misses(stage, time_ns)
+
+    def misses(self, stage: int, time_ns: int) -> bool:
+        """Returns whether a message that is due at `time_ns` is neither in use nor here."""
+        return any(slot.link.due(time_ns) > slot.in_use and not slot.newer for slot in self._stage_slots[stage])
+
+
+def _heard_ns(slot: _Slot, time_ns: int, at_ns: int, last_ns: int) -> int:
+    """Returns the first instant from `at_ns` on at which an input has something newer than is in use, at the latest `last_ns`.
+
+    It is `at_ns` if nothing newer is due at `time_ns`."""
+    link = slot.link
+    if link.due(time_ns) <= slot.in_use:
+        return at_ns
+    if slot.prompt or link.newest(at_ns) > slot.in_use:
+        return at_ns
+    arrives_ns = link.next_arrival(slot.in_use)
+    return last_ns if arrives_ns is None else max(at_ns, arrives_ns)
+
+
+def _change_ns(slot: _Slot, time_ns: int) -> int:
+    """Returns the first instant after `time_ns` at which an input changes; `NEVER_NS` if there is none."""
+    arrives_ns = slot.link.next_arrival(slot.in_use)
+    change_ns = NEVER_NS if arrives_ns is None else arrives_ns
+    current = slot.current
+    if current is not None and current.values.size and slot.timeout_ns < NEVER_NS:
+        expires_ns = slot.plan.expires_ns(current.time_ns)
+        if time_ns < expires_ns < change_ns:
+            return expires_ns
+    return change_ns

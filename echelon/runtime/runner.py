@@ -9,7 +9,7 @@ thread moves the role are put aside, and the main thread takes them.  It does no
 `mailbox.MAX_AHEAD` bounds the messages on their way to a receiver that reads nothing, and a session has room for 128 KiB.
 
 On a wall clock the main thread also wakes at each instant and each deadline.  A stage whose deadline has come runs with the
-newest messages that have come, and is counted as late if one was missing.
+newest messages that have come, and is counted as late if one was missing (`echelon.runtime.mailbox.WallMailbox`).
 """
 
 import threading
@@ -22,8 +22,8 @@ from typing import Final
 
 from echelon.messages import Message
 from echelon.plan.plan import Plan
-from echelon.role import Role, Stage
-from echelon.runtime.mailbox import Mailbox
+from echelon.role import Acts, Role, Stage
+from echelon.runtime.mailbox import Mailbox, WallMailbox
 from echelon.runtime.session import Publisher, Session
 from echelon.runtime.turns import deadline_ns
 from echelon.runtime.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
@@ -51,7 +51,7 @@ class RunnerCounts:
     refused: dict[str, int] = field(default_factory=dict)
     """Received payloads that were not messages for this role, by reason"""
     late: int = 0
-    """Stages that ran at their deadline with an input missing (wall clock)"""
+    """Stages that ran at their deadline with an input missing, or got nothing newer in a whole period (wall clock)"""
     stages: int = 0
     """Stages that ran (wall clock)"""
     latest_ns: int = 0
@@ -99,7 +99,8 @@ class Runner:
         members = plan.all_roles
         member = members[role.index]
         self.role, self.plan = role, plan
-        self.mailbox = Mailbox(role, plan, paced=virtual)
+        self._of_clock = None if virtual else WallMailbox(role, plan)
+        self.mailbox = self._of_clock or Mailbox(role, plan, paced=True)
         self.counts = RunnerCounts()
         channels = sorted({link.channel for link in plan.links if link.source == role.index})
         self._puts = {channel: session.publisher(data_key(run, member.path, channel)).put for channel in channels}
@@ -126,6 +127,8 @@ class Runner:
         # On a wall clock: run time 0 in `time.monotonic_ns`, and how long after an instant each stage may wait.
         self._start_ns: int | None = None
         self._allowed_ns: list[int] = []
+        self._has_acted = False  # the stage at `_at` has acted, and acts again when something arrives
+        self._changed_ns = 0  # run time of its last act
 
         inputs = {slot_input for stage in role.stages for slot_input in stage.inputs}
         keys = sorted(data_key(run, members[one.source].path, one.channel) for one in inputs)
@@ -212,7 +215,7 @@ class Runner:
             if self._time_ns % stage.period_ns == 0:
                 if mailbox.missing(number, self._time_ns):
                     return False
-                if self._run_stage(number, stage, self._time_ns):
+                if self._run_stage(number, stage):
                     self._wake.set()  # a batch is complete, and the main thread sends it
             self._moved += 1
             self._at += 1
@@ -229,11 +232,14 @@ class Runner:
     def wall_clock(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
 
-        A stage runs in the handler of the message that completes its inputs.  At the deadline of its turn
-        (`echelon.runtime.turns`) it runs with the messages that have come.
+        A stage runs in the handler of the message that completes its inputs.  At its deadline it runs with the messages that
+        have come: at the end of its period, or at the deadline of its turn (`echelon.runtime.turns`).
         """
         self._allowed_ns = [
-            deadline_ns(self.plan, stage.turn, stage.depth, stage.period_ns) for stage in self.role.stages
+            deadline_ns(self.plan, stage.turn, stage.depth, stage.period_ns)
+            if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT)
+            else stage.period_ns - 1
+            for stage in self.role.stages
         ]
         self._start_ns = start_ns
         while True:
@@ -249,25 +255,34 @@ class Runner:
     def _pace(self) -> int:
         """Runs the stages that are due; returns the instant of `time.monotonic_ns` at which it must be called again, even if
         nothing is received until then."""
-        mailbox, counts, start_ns = self.mailbox, self.counts, self._start_ns
+        mailbox, counts, start_ns = self._of_clock, self.counts, self._start_ns
+        assert mailbox is not None
         assert start_ns is not None
         while not self._finished:
-            begins_ns = start_ns + self._time_ns
-            if time.monotonic_ns() < begins_ns:
-                return begins_ns
+            due_ns = self._time_ns
+            if time.monotonic_ns() - start_ns < due_ns:
+                return start_ns + due_ns
             for number, stage in self._stages[self._at :]:
                 self._at = number
-                if self._time_ns % stage.period_ns:
+                if due_ns % stage.period_ns:
                     continue
-                deadline_ns = begins_ns + self._allowed_ns[number]
-                if mailbox.missing(number, self._time_ns):
-                    if time.monotonic_ns() < deadline_ns:
-                        return deadline_ns
-                    counts.late += 1
-                counts.stages += 1
-                if stage.inputs:
-                    counts.latest_ns = max(counts.latest_ns, time.monotonic_ns() - deadline_ns)
-                self._run_stage(number, stage, self._time_ns)
+                if not self._has_acted:
+                    deadline_ns = due_ns + self._allowed_ns[number]
+                    ready_ns, missed = mailbox.ready(number, due_ns, deadline_ns)
+                    now_ns = time.monotonic_ns() - start_ns
+                    if now_ns < ready_ns:
+                        return start_ns + ready_ns
+                    counts.late += missed
+                    counts.stages += 1
+                    if stage.inputs:
+                        counts.latest_ns = max(counts.latest_ns, now_ns - deadline_ns)
+                    self._act(number, stage, now_ns)
+                if stage.acts is Acts.ON_ARRIVAL and due_ns < self.plan.duration_ns:
+                    self._has_acted = True
+                    wake_ns = self._on_arrivals(number, stage)
+                    if wake_ns is not None:
+                        return start_ns + wake_ns
+                    self._has_acted = False
             self._at = 0
             self._time_ns += self._tick_ns
             self._finished = self._time_ns > self.plan.duration_ns
@@ -275,6 +290,30 @@ class Runner:
                 self._copies.close()
                 self._copies.send()
         return start_ns + self._time_ns
+
+    def _act(self, number: int, stage: Stage, now_ns: int) -> None:
+        """Lets a stage act now, at a run time within the period that began when it was due."""
+        assert self._of_clock is not None
+        at_ns = due_ns = self._time_ns
+        if stage.acts in (Acts.WHEN_HEARD, Acts.ON_ARRIVAL):
+            at_ns = min(max(now_ns, due_ns), due_ns + stage.period_ns - 1)
+        self._changed_ns = max(at_ns, now_ns)
+        for message in stage.run(at_ns, self._of_clock.take(number, self._changed_ns)):
+            self._send(message)
+
+    def _on_arrivals(self, number: int, stage: Stage) -> int | None:
+        """Lets a stage act on what has arrived since its last act; returns the run time at which this must be called again, or
+        None if its period is over."""
+        assert self._of_clock is not None
+        assert self._start_ns is not None
+        end_ns = self._time_ns + stage.period_ns
+        while (now_ns := time.monotonic_ns() - self._start_ns) < end_ns:
+            change_ns = self._of_clock.next_change(number, self._changed_ns)
+            if change_ns > now_ns:
+                return min(change_ns, end_ns)
+            self._act(number, stage, now_ns)
+        self.counts.late += self._of_clock.misses(number, self._time_ns)
+        return None
 
     def _receive_paced(self, payload: bytes) -> None:
         """Takes a payload in Zenoh's thread on a wall clock, and runs the stages that are due."""
@@ -325,11 +364,12 @@ class Runner:
         if self._copies is not None:
             self._copies.send()
 
-    def _run_stage(self, number: int, stage: Stage, time_ns: int) -> bool:
-        """Runs a stage and sends its messages; returns True if this completes a batch of copies."""
+    def _run_stage(self, number: int, stage: Stage) -> bool:
+        """Runs a stage that is due in a lockstep, and sends its messages; returns True if this completes a batch of copies."""
         complete = False
-        for message in stage.run(time_ns, self.mailbox.take(number, time_ns)):
-            complete |= self._send(message)
+        for at_ns, heard in self.mailbox.acts(number, self._time_ns):
+            for message in stage.run(at_ns, heard):
+                complete |= self._send(message)
         return complete
 
     def _send(self, message: Message) -> bool:
@@ -345,4 +385,7 @@ class Runner:
         except WireError as error:
             count_refusal(self.counts.refused, error.reason)
             return
-        self.mailbox.deliver(message)
+        if self._of_clock is None:
+            self.mailbox.deliver(message)
+        else:
+            self._of_clock.receive(message, time.monotonic_ns() - (self._start_ns or 0))

@@ -4,18 +4,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from echelon.parameters import Finite, Positive
 from echelon.scenario.part_fields import ProtocolField
 from echelon.scenario.values import (
     Bitrate,
     Constant,
     ConstantOrZero,
-    Finite,
     Flag,
     Fraction,
     Limit,
     Name,
     NodeId,
-    Positive,
     Seconds,
     SecondsOrZero,
     Table,
@@ -196,4 +195,4 @@ class BusOff(Table):
     bus-off"""
 
 
-Event = Annotated[DriveFault | Estop | ErrorFrames | BusOff, Field(discriminator="kind")]
+CanEvent = DriveFault | Estop | ErrorFrames | BusOff

@@ -16,7 +16,8 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import BaseModel, PlainSerializer, PlainValidator, SerializationInfo, ValidationInfo, WithJsonSchema
 
-from echelon.plugins import Part, PartError, Registry, Source
+from echelon.part_groups import Registry
+from echelon.plugins import Part, PartError, Source
 
 KIND: Final = "kind"
 _PARAMETERS: Final = "parameters"

@@ -6,12 +6,14 @@ pydantic's `use_attribute_docstrings` it would be read for every table of every 
 
 import json
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any, Final
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 
 from echelon.docstrings import field_docstrings
-from echelon.plugins import Plugin, Registry
+from echelon.part_groups import Registry
+from echelon.plugins import Plugin
 from echelon.scenario.part_fields import BESIDE, KIND, PART
 from echelon.scenario.tables import Scenario
 from echelon.scenario.values import Table
@@ -42,6 +44,8 @@ HEAD: Final = """\
 
 All keys of a scenario, made from their source by `make docs`.  `echelon schema scenario` prints the same as a JSON schema
 for editors, `echelon validate FILE` checks a file, and `echelon new NAME` writes one to begin with.
+
+Rules of links, with examples: [links.md](links.md).
 
 A part of your own (a law, a plant, a trajectory, a drive protocol) is a class in a Python file beside the scenario:
 `trajectory = { use = "my_paths.py:Eight", parameters = { … } }` ([how to](add-a-law.md)).
@@ -80,13 +84,13 @@ def _built_in(registry: Registry) -> Iterator[tuple[str, str, type[Plugin]]]:
     These are all laws, all parts that are written with their `kind`, and all other parts that have parameters."""
     for group in registry.groups.values():
         for name, part in group.built_in.items():
-            if part.model_fields or group.name in (WITH_KIND, "laws"):
+            if fields(part) or group.name in (WITH_KIND, "laws"):
                 yield group.name, name, part
 
 
 def _part(group: str, name: str, part: type[Plugin]) -> Schema:
     """Returns the schema of a built-in part's parameters, with the key `kind` if its group is written with it."""
-    table = part.model_json_schema()
+    table = TypeAdapter(part).json_schema()
     assert "$defs" not in table, "parameters of parts are plain values"
     if group != WITH_KIND:
         return {"properties": {}, **table}
@@ -123,7 +127,7 @@ def reference_page(registry: Registry) -> str:
             where += f", kind `{kind}`"
         sections.append(f"## {where or 'The file'}\n\n{_text(table['description'])}\n\n{_rows(table)}")
     for group, name, part in _built_in(registry):
-        if group != WITH_KIND and part.model_fields:
+        if group != WITH_KIND and fields(part):
             table = schema["$defs"][part.__name__]
             where = f"`parameters` of `{USE_KEYS[group]} = {json.dumps(name)}`"
             sections.append(f"## {where}\n\n{_text(table['description'])}\n\n{_rows(table)}")

@@ -2,14 +2,17 @@
 
 A robot's values come from three levels: `[robot]` for all robots, `robot` of its group and of the groups around that, and the
 robot's own table.  `echelon.planning.loading` reads files, applies overrides and explains mistakes;
-`echelon.planning.plan_maker` makes the plan that roles work with; `echelon.scenario.can_tables` has the tables of the CAN bus.
+`echelon.planning.plan_maker` makes the plan that roles work with.  `echelon.scenario.can_tables` has the tables of the CAN bus,
+`echelon.scenario.link_tables` those of links.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import Discriminator, Field, SerializationInfo, Tag, field_serializer, model_validator
+from pydantic import Field, SerializationInfo, field_serializer, model_validator
 
-from echelon.scenario.can_tables import Can, DriveTable, EnvelopeTable, Event
+from echelon.parameters import Finite, NonNegative, Point, Positive
+from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop
+from echelon.scenario.link_tables import Blackout, Clock, CutOff, LinkRule
 from echelon.scenario.part_fields import (
     LawName,
     LawParameters,
@@ -20,28 +23,26 @@ from echelon.scenario.part_fields import (
 )
 from echelon.scenario.values import (
     CouplingGain,
-    Finite,
     Flag,
     Fraction,
     Gain,
     Limit,
     Name,
-    NonNegative,
-    Point,
-    Positive,
     Seconds,
     Table,
     alike,
 )
-from echelon.scenario.values import number_or_table as _number_or_table
 
-ChannelName = Literal["state", "group_state", "reference", "command", "torque", "*"]
 BLOCK_NAMES = ("intra", "middle", "inter", "centroid")
 """Names of blocks and of layers of blocks.  Groups cannot have these names."""
 
 
 RESERVED_NAMES = ("coordinator", "bridge", "drives", "recorder", "referee")
 """Names of processes.  Robots and groups cannot have these names."""
+
+
+EVENT_DRIVEN: Final = "event_driven"
+Timing = Literal["event_driven", "time_driven"]
 
 
 class Periods(Table):
@@ -76,6 +77,8 @@ class RobotTable(Table):
     """Position of the reference point at the start [m]; must be given.  The robot starts at rest"""
     heading: Finite | None = None
     """θ, heading at the start, counter-clockwise from the x axis [rad]; 0 unless given"""
+    timing: Timing | None = None
+    """When it takes an acceleration; `timing` of its group unless given"""
     torque_limit: Limit | None = None
     """Largest torque of a wheel [N m]; unlimited unless given"""
     torque_rate_limit: Limit | None = None
@@ -88,6 +91,8 @@ class RobotTable(Table):
     """The drives of its wheels"""
     envelope: EnvelopeTable | None = None
     """Limits of the torque commands that the bridge sends to its drives"""
+    clock: Clock | None = None
+    """Its clock; it shows the run time unless given"""
 
 
 class Shape(Table):
@@ -136,6 +141,10 @@ class Group(Table):
     """Its child groups by name"""
     period: Positive | None = None
     """Acceleration period of this node [s]: a multiple of its child groups' periods; `periods.acceleration` unless given"""
+    timing: Timing | None = None
+    """When this node, its robots and the groups below it act; `timing` of the group around it unless given"""
+    clock: Clock | None = None
+    """The clock of this node; it shows the run time unless given.  Robots' clocks are in `robot`"""
 
     @model_validator(mode="after")
     def _children(self) -> "Group":
@@ -224,49 +233,6 @@ class Avoidance(Table):
         return self
 
 
-class Uniform(Table):
-    """A random delay, uniform between two bounds."""
-
-    min: NonNegative
-    """Shortest delay [s]"""
-    max: NonNegative
-    """Longest delay [s]"""
-
-    @model_validator(mode="after")
-    def _bounds(self) -> "Uniform":
-        if self.max < self.min:
-            raise ValueError(f"max = {self.max} must be at least min = {self.min}")
-        return self
-
-
-Delay = Annotated[
-    Annotated[NonNegative, Tag("a number")] | Annotated[Uniform, Tag("a table")], Discriminator(_number_or_table)
-]
-
-
-class LinkRule(Table):
-    """Delay and loss of links.  For each link the last rule that fits it holds, and only that one."""
-
-    source: str = "**"
-    """The sender: a path in the tree (`g1/r2`) or `coordinator`; `*` stands for one chunk of a path, `**` for any number"""
-    receiver: str = "**"
-    """The receiver, written as `source`"""
-    channel: ChannelName = "*"
-    """The channel; `*` stands for all channels"""
-    delay: Delay = 0.0
-    """How long a message takes [s]: a number, or a table of two bounds.  A receiver uses the message at its first instant at or
-    after the arrival"""
-    loss: Fraction = 0.0
-    """Probability that a message is lost, independent of all other messages"""
-    policy: Literal["hold", "hold_then_stop"] | None = None
-    """What a receiver uses when nothing newer has come: the last message that came, for ever (`hold`) or until it is older
-    than `timeout` (`hold_then_stop`).  Unless given: `hold` if torque is mirrored, `hold_then_stop` if the torque path is
-    closed"""
-    timeout: Seconds | None = None
-    """Age above which a message is not used any more, for `hold_then_stop` [s]; unless given, `can.watchdog`, or two periods of
-    the link if that is longer"""
-
-
 class Record(Table):
     """The recording."""
 
@@ -337,6 +303,9 @@ class Health(Table):
     """Largest share of stages that run at their deadline without all of their inputs, on a wall clock"""
 
 
+Event = Annotated[DriveFault | Estop | ErrorFrames | BusOff | Blackout | CutOff, Field(discriminator="kind")]
+
+
 class Scenario(Table):
     """A whole scenario: one TOML file.  Numbers are in SI units.  The angles `heading` and `phase` and the angular speed `rate`
     use radians, the angles `rotation` and `angle` degrees."""
@@ -351,6 +320,11 @@ class Scenario(Table):
     """Seed of all random draws: delays, losses, error frames"""
     periods: Periods = Periods()
     """The periods of accelerations and torques"""
+    timing: Timing = EVENT_DRIVEN
+    """When nodes and robots act, unless a group or a robot says otherwise (docs/architecture.md, 4.6).  `event_driven`: in each
+    of its periods a node acts as soon as every input has something newer, at the latest at the end of the period, and a robot
+    takes an acceleration when it arrives.  `time_driven`: they act at the beginning of each period with what has arrived, so
+    any delay costs at least a period.  On the closed torque path robots take accelerations when a torque period begins"""
     robot: RobotTable = RobotTable()
     """Values that all robots share"""
     formation: Group
@@ -372,4 +346,4 @@ class Scenario(Table):
     health: Health = Health()
     """Limits of the checks that are made of every run"""
     events: list[Event] = []
-    """Scheduled events: faults of drives, emergency stops, disturbances of a bus"""
+    """Scheduled events: faults of drives, emergency stops, disturbances of a bus, blackouts of links, members cut off"""

@@ -5,10 +5,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from echelon.parameters import Finite, Positive
+
 # Numbers are strict: pydantic refuses `true` and "1.5".
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(strict=True, gt=0, le=1e6, allow_inf_nan=False)]
 """A duration or an instant [s], at most 10⁶ s"""
 SecondsOrZero = Annotated[float, Field(strict=True, ge=0, le=1e6, allow_inf_nan=False)]
@@ -18,7 +17,6 @@ ConstantOrZero = Annotated[float, Field(strict=True, ge=0, le=1e6, allow_inf_nan
 Limit = Annotated[float, Field(strict=True, gt=0)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Flag = Annotated[bool, Field(strict=True)]
-Point = tuple[Finite, Finite]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 """Name of a scenario, robot, group or bus.  In ROS topics and DBC identifiers, which allow no hyphens, they become
 underscores"""

@@ -50,6 +50,8 @@ class Row(NamedTuple):
     turn: Turn
     period_ns: int
     first_ns: int
+    prompt: bool
+    """True if these stages act at their nominal instants, once in each period"""
     stages: list[tuple[int, int, Callable[[int, Sequence[Heard]], tuple[Message, ...]], Mailbox]]
 
     def is_due(self, time_ns: int) -> bool:
@@ -59,12 +61,14 @@ class Row(NamedTuple):
 
 def _timetable(plan: Plan, roles: Sequence[Role], mailboxes: Sequence[Mailbox]) -> list[Row]:
     """Returns all stages of a run in the order of their turns."""
-    rows: dict[tuple[int, int, int], Row] = {}
+    rows: dict[tuple[int, int, int, bool], Row] = {}
     for role in roles:
+        mailbox = mailboxes[role.index]
         for number, stage in enumerate(role.stages):
-            key = level(plan, stage.turn, stage.depth), stage.period_ns, stage.first_ns
-            row = rows.setdefault(key, Row(stage.turn, stage.period_ns, stage.first_ns, []))
-            row.stages.append((role.index, number, stage.run, mailboxes[role.index]))
+            prompt = mailbox.prompt[number]
+            key = level(plan, stage.turn, stage.depth), stage.period_ns, stage.first_ns, prompt
+            row = rows.setdefault(key, Row(stage.turn, stage.period_ns, stage.first_ns, prompt, []))
+            row.stages.append((role.index, number, stage.run, mailbox))
     return [row for _, row in sorted(rows.items())]
 
 
@@ -104,8 +108,12 @@ class Engine:
             self._sink,
         )  # the body of `post` is repeated below, since this is the innermost loop
         for time_ns in range(self.first_ns, self.plan.duration_ns + 1, self.tick_ns):
-            for _, period_ns, first_ns, stages in self.timetable:
+            for _, period_ns, first_ns, prompt, stages in self.timetable:
                 if time_ns % period_ns or time_ns < first_ns:
+                    continue
+                if not prompt:
+                    for _, number, run, mailbox in stages:
+                        self.act(time_ns, number, run, mailbox)
                     continue
                 for _, number, run, mailbox in stages:
                     for message in run(time_ns, mailbox.take(number, time_ns)):
@@ -115,6 +123,14 @@ class Engine:
                         if sink is not None:
                             sink(message)
             yield time_ns
+
+    def act(
+        self, time_ns: int, number: int, run: Callable[[int, Sequence[Heard]], tuple[Message, ...]], mailbox: Mailbox
+    ) -> None:
+        """Lets a stage act that is due at `time_ns`, as often as it does in its period."""
+        for at_ns, heard in mailbox.acts(number, time_ns):
+            for message in run(at_ns, heard):
+                self.post(message)
 
     def post(self, message: Message) -> None:
         """Hands a message to all its receivers."""

@@ -45,7 +45,7 @@ def _rounding(plan: Plan, link: LinkPlan) -> str | None:
     """Returns the delay like which that of a link acts, in words; None if it is the same."""
     tick_ns, least_ns, most_ns = tick_of(plan, link), link.delay_min_ns, link.delay_max_ns
     tick = f"messages are used at multiples of {tick_ns / 1e9:g} s"
-    if most_ns > plan.duration_ns:
+    if most_ns > plan.duration_ns or link.delays is not None:
         return None
     if least_ns == most_ns:
         acts_ns = ticks_up(least_ns, tick_ns)

@@ -13,9 +13,10 @@ from echelon.bridge.protocols.trial import try_protocols
 from echelon.controller.laws import LAWS, Law
 from echelon.controller.trajectory import TRAJECTORIES, Trajectory
 from echelon.errors import PartRunError
+from echelon.part_groups import PartGroup, Registry
 from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError
-from echelon.plugins import Part, PartError, PartGroup, Plugin, Registry, Source
+from echelon.plugins import Part, PartError, Plugin, Source
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.probe import probe
 from echelon.sim.parts.time_limit import TookTooLong, time_limit

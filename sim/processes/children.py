@@ -22,7 +22,8 @@ from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.process import main
 from echelon.sim.processes.to_supervisor import Done
 
-PRELOAD: Final = ["echelon.sim.processes.process"]
+PRELOAD: Final = ["echelon.sim.processes.process", "echelon.bridge.protocols.protocol"]
+"""Modules that each process needs, the second one because the plan holds the protocols of drives"""
 ENVIRONMENT: Final = {"PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
 """Environment variables of the processes.  The matrices of a formation are small, so threads of numpy would only cost time."""
 LAST_WORDS: Final = 4000

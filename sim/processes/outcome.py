@@ -30,8 +30,14 @@ class Progress:
     """When the run began, on the monotonic clock [s]; 0 before that"""
     bridge: BridgeProgress = field(default_factory=BridgeProgress)
     drives: BridgeProgress = field(default_factory=BridgeProgress)
+    links: dict[tuple[int, int, int], LinkCounts] = field(default_factory=dict)
+    """The last counts of links, by receiver, source and channel"""
     note: str = ""
     """News for the user, for example which process everyone waits for"""
+
+    def hear_links(self, links: Iterable[LinkCounts]) -> None:
+        """Takes over counts of links."""
+        self.links |= {(each.receiver, each.source, each.channel): each for each in links}
 
     def hear(self, recorder: RecorderProgress) -> None:
         """Takes over the progress of the recorder."""

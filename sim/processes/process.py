@@ -10,17 +10,26 @@ import select
 import signal
 import sys
 import threading
+import time
 import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from io import TextIOWrapper
 from multiprocessing.connection import Connection
 from typing import Final
 
 from echelon.errors import PartRunError
+from echelon.messages import Heard, Message
+from echelon.role import Role
+from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
 from echelon.sim.engines.in_process import make_role
 from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, meet
-from echelon.sim.processes.to_supervisor import Failed, PartFailed, Waiting
+from echelon.sim.processes.to_supervisor import Failed, LinksProgress, PartFailed, Said, Waiting
+
+TOLD_S: Final = 1.0
+"""Time between two reports of a member's links, for the live table [s]"""
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
@@ -31,6 +40,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
     """Runs a process of a run until its work is done.  A failure ends the process with exit code 1.
 
     `control` is its pipe to the supervisor, `words` the pipe that gets its standard error."""
+    gc.freeze()  # what the fork server imported stays; to look through it takes 10 ms and copies its shared pages
     _die_with(control)
     _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # the name in ps, top and pgrep (15 characters)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but only the supervisor reacts
@@ -84,23 +94,49 @@ def _open(spec: ProcessSpec) -> Session:
         raise StartError(str(error)) from None
 
 
+class _LinkTeller:
+    """A role whose last stage also tells the supervisor the counts of the role's links, every `TOLD_S`."""
+
+    def __init__(self, role: Role, say: Callable[[LinksProgress], None]) -> None:
+        *first, last = role.stages
+        self.index = role.index
+        self.stages = (*first, replace(last, run=self._run))
+        self.counts: Callable[[], list[LinkCounts]] = list
+        """Returns the counts of the links"""
+        self._told, self._say, self._told_s = last.run, say, time.monotonic()
+
+    def _run(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        if (now_s := time.monotonic()) > self._told_s + TOLD_S:
+            self._told_s = now_s
+            self._say(LinksProgress(tuple(self.counts())))
+        return self._told(time_ns, heard)
+
+
 def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:
     """Runs a robot, a leader or the coordinator."""
+    one_at_a_time = threading.Lock()  # stages run in the thread that brings their messages, or in the main thread
+
+    def say(said: Said) -> None:
+        with one_at_a_time:
+            control.send(said)
+
+    role = _LinkTeller(make_role(spec.plan, spec.index), say)
     runner = Runner(
-        make_role(spec.plan, spec.index),
+        role,
         spec.plan,
         session,
         spec.run,
         watched=spec.watched,
         virtual=spec.virtual,
     )
+    role.counts = runner.mailbox.counts
     start_ns = meet(spec, session, control)
     signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())
     gc.collect()
     gc.disable()  # the loop makes no reference cycles, and a pause of one role delays all others
     try:
         if spec.virtual:
-            runner.lockstep(lambda time_ns, sources: control.send(Waiting(time_ns, tuple(sources))))
+            runner.lockstep(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
         else:
             runner.wall_clock(start_ns)
     except SystemExit:  # the run breaks off; what was counted so far is still told

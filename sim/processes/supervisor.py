@@ -32,7 +32,16 @@ from echelon.sim.processes.failures import NAMED, DivergedError, RunError, Stall
 from echelon.sim.processes.outcome import Outcome, Progress, outcome_of
 from echelon.sim.processes.stalls import StallWatch
 from echelon.sim.processes.to_process import Start, Told
-from echelon.sim.processes.to_supervisor import Done, Failed, PartFailed, Ready, RecorderProgress, Said, Waiting
+from echelon.sim.processes.to_supervisor import (
+    Done,
+    Failed,
+    LinksProgress,
+    PartFailed,
+    Ready,
+    RecorderProgress,
+    Said,
+    Waiting,
+)
 
 START_TIMEOUT_S: Final = 30.0
 """How long processes may take to become ready [s]"""
@@ -189,6 +198,8 @@ class Supervisor:
                 child.ready = True
             case Waiting():
                 child.waiting_ns, child.waiting_for = said.time_ns, list(said.sources)
+            case LinksProgress():
+                progress.hear_links(said.links)
             case BridgeProgress() if child.spec.kind == "bridge":
                 progress.bridge = said
             case BridgeProgress():

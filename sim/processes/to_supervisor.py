@@ -37,6 +37,13 @@ class Waiting:
 
 
 @dataclass(frozen=True, slots=True)
+class LinksProgress:
+    """The counts of the links into a process up to now."""
+
+    links: tuple[LinkCounts, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Lost:
     """The first state that is not finite: of which robot (its index), and when."""
 
@@ -96,5 +103,5 @@ class Done:
     report: Report | None = None
 
 
-Said = Ready | Failed | PartFailed | Waiting | BridgeProgress | RecorderProgress | Done
+Said = Ready | Failed | PartFailed | Waiting | LinksProgress | BridgeProgress | RecorderProgress | Done
 """Any message of a process."""

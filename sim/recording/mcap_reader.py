@@ -35,7 +35,7 @@ from echelon.sim.results.trace import Trace
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
 _LINK: Final = struct.Struct("<IIB")
-_COUNTS: Final = struct.Struct("<6Qdq")
+_COUNTS: Final = struct.Struct("<6Qd4qQ")
 _READERS: Final = {
     Opcode.ATTACHMENT: Attachment.read,
     Opcode.CHANNEL: Channel.read,

@@ -90,7 +90,8 @@ class ChunkedFile:
         ]
         start, self._indexes = MAGIC + _records(Header("ros2", LIBRARY)), list[McapRecord]()
         for name, data in attachments.items():
-            media_type = "text/x-python" if name.endswith(".py") else "application/toml"
+            suffix = name.rpartition(".")[2]
+            media_type = {"py": "text/x-python", "toml": "application/toml"}.get(suffix, "text/plain")
             record = _records(Attachment(0, 0, name, media_type, data))
             self._indexes.append(AttachmentIndex(len(start), len(record), 0, 0, len(data), name, media_type))
             start += record

@@ -251,5 +251,7 @@ def link_statistics(time_ns: int, counts: LinkCounts, name: str) -> bytes:
     """Returns an echelon_msgs/LinkStatistics; `name` says which link it is, for people."""
     layout = Layout().header("").put("I", counts.source, counts.receiver).put("B", counts.channel).string(name)
     layout.put("Q", counts.sent, counts.delivered, counts.lost, counts.in_flight, counts.used, counts.held)
-    layout.put("d", counts.age_mean_ns).put("q", counts.age_max_ns)
+    layout.put("d", counts.age_mean_ns)
+    layout.put("q", counts.age_max_ns, counts.age_p50_ns, counts.age_p95_ns, counts.age_p99_ns)
+    layout.put("Q", counts.duplicates)
     return stamp(time_ns) + bytes(layout.body[8:])

@@ -52,7 +52,7 @@ DEFINITIONS: Final = {
     "echelon_msgs/NullMessage": _HEADER + "uint32 source\nuint8 channel\nuint64 sequence\n",
     "echelon_msgs/LinkStatistics": _HEADER + "uint32 source\nuint32 receiver\nuint8 channel\nstring name\nuint64 sent\n"
     "uint64 delivered\nuint64 lost\nuint64 in_flight\nuint64 used\nuint64 held\n"
-    "float64 age_mean_ns\nint64 age_max_ns\n",
+    "float64 age_mean_ns\nint64 age_max_ns\nint64 age_p50_ns\nint64 age_p95_ns\nint64 age_p99_ns\nuint64 duplicates\n",
 }
 """Message definitions by name, without the middle part `msg`.  Types of fields are written with their package."""
 

@@ -67,9 +67,10 @@ class _Replayed:
             source.deliver(self._mailbox, time_ns + self._ahead_ns)
         for number, stage in self._stages:
             if time_ns % stage.period_ns == 0 and time_ns >= stage.first_ns:
-                for message in stage.run(time_ns, self._mailbox.take(number, time_ns)):
-                    if not message.is_null:
-                        self._sent.setdefault(message.channel, []).append(message)
+                for at_ns, heard in self._mailbox.acts(number, time_ns):
+                    for message in stage.run(at_ns, heard):
+                        if not message.is_null:
+                            self._sent.setdefault(message.channel, []).append(message)
 
     def series(self) -> Iterator[Series]:
         """Yields the messages with values that the role has sent, channel by channel."""

@@ -197,13 +197,14 @@ def can(one: ShownRun) -> str:
 def link_table(one: ShownRun) -> str:
     """Returns the table of links."""
     links = one.run.summary.links
-    head = ["link", "channel", "sent", "lost", "in flight", "held", "mean age", "largest"]
+    counted = ["sent", "lost", "in flight", "twice", "held"]
+    head = ["link", "channel", *counted, "mean age [s]", "p50", "p95", "p99", "largest"]
     rows = [
         [
             f"{row.source} → {row.receiver}",
             row.channel.replace("_", " "),
-            *(row.sent, row.lost, row.in_flight, row.held),
-            *(number(row.age_mean), number(row.age_max)),
+            *(row.sent, row.lost, row.in_flight, row.duplicates, row.held),
+            *map(number, (row.age_mean, row.age_p50, row.age_p95, row.age_p99, row.age_max)),
         ]
         for row in links[:MAX_ROWS]
     ]

@@ -248,6 +248,8 @@ def _finite(value: SupportsFloat) -> float | None:
 def link_result(plan: Plan, counts: LinkCounts) -> LinkResult:
     """Returns the counts of a link with the names of its ends: a row of `links.csv`."""
     members = plan.all_roles
+    ages = counts.age_mean_ns, counts.age_p50_ns, counts.age_p95_ns, counts.age_p99_ns, counts.age_max_ns
+    mean, p50, p95, p99, largest = (age_ns / 1e9 if counts.used else None for age_ns in ages)
     return LinkResult(
         source=members[counts.source].name,
         receiver=members[counts.receiver].name,
@@ -256,10 +258,14 @@ def link_result(plan: Plan, counts: LinkCounts) -> LinkResult:
         delivered=counts.delivered,
         lost=counts.lost,
         in_flight=counts.in_flight,
+        duplicates=counts.duplicates,
         used=counts.used,
         held=counts.held,
-        age_mean=counts.age_mean_ns / 1e9 if counts.used else None,
-        age_max=counts.age_max_ns / 1e9 if counts.used else None,
+        age_mean=mean,
+        age_p50=p50,
+        age_p95=p95,
+        age_p99=p99,
+        age_max=largest,
     )
 
 

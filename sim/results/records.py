@@ -179,17 +179,25 @@ class LinkResult:
     sent: int
     """Messages that were sent"""
     delivered: int
-    """Messages that arrived"""
+    """Messages that arrived, each counted once"""
     lost: int
     """Messages that were lost on the link"""
     in_flight: int
     """Messages on their way at the end of the run"""
+    duplicates: int
+    """Messages that arrived a second time"""
     used: int
     """Uses of messages; a message may be used several times"""
     held: int
     """Uses of a message that had been used before, after the instant it was sent in"""
     age_mean: float | None
     """Mean age of the messages at each use [s]; None if none was ever used"""
+    age_p50: float | None
+    """Age that half of the uses do not exceed [s]"""
+    age_p95: float | None
+    """Age that 95 % of the uses do not exceed [s]"""
+    age_p99: float | None
+    """Age that 99 % of the uses do not exceed [s]"""
     age_max: float | None
     """Largest age of a message at a use [s]; None if none was ever used"""
 

@@ -20,7 +20,7 @@ from echelon.sim.results.measures import (
     separation_results,
     torque_result,
 )
-from echelon.sim.results.records import FORMAT, PartResult, RunFacts, Summary
+from echelon.sim.results.records import FORMAT, LinkResult, PartResult, RunFacts, Summary
 from echelon.sim.results.trace import Trace
 
 
@@ -97,9 +97,9 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
     if summary.links:
         sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
-        ages = [link.age_max for link in summary.links if link.age_max is not None]
-        oldest = f"oldest in use {number(max(ages), 's')}" if ages else "no message was used"
-        yield f"  links    {sent} messages, {lost} lost, {oldest}"
+        twice = sum(link.duplicates for link in summary.links)
+        counts = f"{sent} messages, {lost} lost{f', {twice} twice' if twice else ''}"
+        yield f"  links    {counts}, {_ages(summary.links)}"
     yield from can_lines(summary.can)
     run = summary.run
     if run.clock == "wall" and run.stages:
@@ -107,6 +107,17 @@ def _lines(summary: Summary) -> Iterator[str]:
     if run.wall_time is not None:
         yield f"  wall     {number(run.wall_time, 's')}, {number(run.real_time_factor)} times real time"
     yield f"  digest   {summary.trace_digest}"
+
+
+def _ages(links: Sequence[LinkResult]) -> str:
+    """Returns the largest age, and of the link on which it is largest the age that 99 % of the uses do not exceed."""
+    ages = [(link.age_p99, link.age_max, f"{link.source} → {link.receiver}") for link in links]
+    used = [(p99, largest, name) for p99, largest, name in ages if p99 is not None and largest is not None]
+    if not used:
+        return "no message was used"
+    oldest = f"oldest in use {number(max(largest for _, largest, _ in used), 's')}"
+    p99, _, name = max(used)
+    return f"{oldest}; 99 % of uses up to {number(p99, 's')} ({name})" if any(p < q for p, q, _ in used) else oldest
 
 
 def number(value: float | None, unit: str = "", missing: str = "–") -> str:

@@ -39,12 +39,14 @@ UNITS: Final[Mapping[str, str]] = MappingProxyType({
     "value": "m", "desired": "m", "error": "m", "norm": "m",
     "rate": "m/s", "error_rate": "m/s",
     "sent": "messages", "delivered": "messages", "lost": "messages", "in_flight": "messages",
-    "used": "uses", "held": "uses", "age_mean": "s", "age_max": "s",
+    "duplicates": "messages", "used": "uses", "held": "uses",
+    "age_mean": "s", "age_p50": "s", "age_p95": "s", "age_p99": "s", "age_max": "s",
     "wanted": "N m", "commanded": "N m", "reported": "N m",
 })  # fmt: skip
 """The units of all columns of numbers in all tables"""
 DESIRED: Final = ("x_desired", "y_desired")
 LINK_KEYS: Final = ("source", "receiver", "channel")
+AGE_KEYS: Final = ("age_mean", "age_p50", "age_p95", "age_p99", "age_max")
 PARTS: Final = ("value", "desired", "error", "rate", "error_rate")
 """The columns of a block's component, fields of `BlockSeries`"""
 
@@ -117,7 +119,7 @@ def blocks_table(blocks: Blocks) -> Table:
 
 def links_table(links: Sequence[LinkResult]) -> Table:
     """Returns a row for each link: the fields of `LinkResult`."""
-    kinds = dict.fromkeys(LINK_KEYS, object) | dict.fromkeys(("age_mean", "age_max"), float)
+    kinds = dict.fromkeys(LINK_KEYS, object) | dict.fromkeys(AGE_KEYS, float)
     columns = {
         field.name: np.array([getattr(link, field.name) for link in links], dtype=kinds.get(field.name, int))
         for field in fields(LinkResult)

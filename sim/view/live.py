@@ -14,6 +14,7 @@ from rich.text import Text
 
 from echelon.controller.transformation import Transformation
 from echelon.plan.plan import Plan
+from echelon.runtime.link import LinkCounts
 from echelon.sim.processes.outcome import Progress
 from echelon.sim.results.desired import Desired
 
@@ -120,7 +121,27 @@ class Display:
         columns = Table.grid(padding=(0, 6))
         columns.add_row(table, errors)
         title = Text(f"{self._plan.name}: {progress.phase}", style="bold")
-        return Group(title, bar, columns)
+        late = any(not link.ideal for link in self._plan.links)
+        return Group(title, bar, columns, *([self._links(progress)] if late else []))
+
+    def _links(self, progress: Progress) -> Table:
+        """Returns a table of links: one row for each rule with a name, and for each channel of the others, with the ages of the
+        link on which they are largest."""
+        groups: dict[str, list[LinkCounts]] = {}
+        for link in self._plan.links:
+            if counts := progress.links.get((link.receiver, link.source, link.channel)):
+                groups.setdefault(link.name or link.channel.name.lower(), []).append(counts)
+        table = Table(box=None, padding=(0, 1))
+        table.add_column("links", style="dim")
+        for head in ("sent", "lost", "in flight", "twice", "p50 [s]", "p95", "p99", "largest"):
+            table.add_column(head, justify="right")
+        for name, links in groups.items():
+            worst = max(links, key=lambda each: (each.age_p99_ns, each.age_max_ns))
+            sent, lost = sum(each.sent for each in links), sum(each.lost for each in links)
+            flying, twice = sum(each.in_flight for each in links), sum(each.duplicates for each in links)
+            ages_ns = worst.age_p50_ns, worst.age_p95_ns, worst.age_p99_ns, max(each.age_max_ns for each in links)
+            table.add_row(name, *map(str, (sent, lost, flying, twice)), *[f"{age_ns / 1e9:.3g}" for age_ns in ages_ns])
+        return table
 
 
 def _metres(error: float, digits: int) -> str:

@@ -177,7 +177,7 @@ def test_mistakes_in_a_file(change, line):
         ("links.0.delay=true", "links.0.delay = true: must be a number or a table"),
         ("links.0.delay=[1]", "links.0.delay = [1]: must be a number or a table"),
         ("links.0.delay=-1", "links.0.delay = -1: must be at least 0"),
-        ("links.0.policy=zero", "links.0.policy = 'zero': must be one of 'hold', 'hold_then_stop'"),
+        ("links.0.policy=zeros", "links.0.policy = 'zeros': must be one of 'hold', 'hold_then_stop', 'zero', 'extrapolate'"),
         ("law.gains.0.k1=x", "law.gains.0.k1 = 'x': must be a number or an array"),
         ("law.gains.0.k1={a=1}", "law.gains.0.k1 = {...}: must be a number or an array"),
         ("law.gains.0.k1=[1]", "law.gains.0.k1.0 = 1: must be an array"),

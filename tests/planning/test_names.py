@@ -8,7 +8,7 @@ import pytest
 
 from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
-from echelon.sim.recording.mcap_reader import _records, read_trace
+from echelon.sim.recording.mcap_reader import read_trace, records
 from echelon.sim.recording.recorder import frame_topics
 from support.runs import echelon, plan_of, summary_of
 
@@ -52,7 +52,7 @@ def test_a_run_with_hyphens_in_all_names(engine: str, tmp_path: Path) -> None:
     plan = load(tmp_path / "x.toml")[1]
     assert [robot.path for robot in plan.robots] == ["left-ones/r-1", "left-ones/r-2", "right/r-1"]
     assert read_trace(out / "run.mcap", plan).digest() == summary_of(tmp_path / "plain")["trace_digest"]
-    topics = {record.topic for record in _records(out / "run.mcap") if hasattr(record, "topic")}
+    topics = {record.topic for record in records(out / "run.mcap") if hasattr(record, "topic")}
     assert {"/left_ones/r_1/state", "/left_ones/r_1/odom", "/left_ones/command", "/can/can_b/frames"} <= topics
     assert all(re.fullmatch(r"(/[a-z][a-z0-9_]*)+", topic) for topic in topics)
     assert {path.name for path in out.glob("*.dbc")} == {"torque-can-a.dbc", "torque-can-b.dbc"}

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 
 import echelon.scenario.tables
 from echelon import shipped
-from echelon.controller.trajectory import Waypoints
 from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError, effective_toml
+from echelon.plugins import PartError
 from echelon.scenario.part_fields import PartContext
 from echelon.scenario.tables import RobotTable, Scenario, Shape
 from echelon.sim.parts.loading import REGISTRY, load, parse
@@ -148,8 +148,8 @@ def test_limits_may_be_infinite_and_nothing_else():
 
 @pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [1.0, 0.5], [0.0, 1.0, 2.0], [-1.0, 0.0]])
 def test_waypoints_need_ascending_times(times):
-    with pytest.raises(ValidationError):
-        Waypoints(points=[(0, 0), (1, 1)], times=times)
+    with pytest.raises(PartError):
+        REGISTRY.make("trajectories", "waypoints", {"points": [(0.0, 0.0), (1.0, 1.0)], "times": times}, Path())
 
 
 @pytest.mark.parametrize("name", ["", "A", "1a", "-a", "a.b", "a/b", "a b", "é", "a" * 33, "a\n", "**"])

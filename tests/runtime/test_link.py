@@ -6,8 +6,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from echelon.messages import Channel
+from echelon.plan.delay_tables import LOST, Bursts, DelayTrace
 from echelon.plan.plan import LinkPlan
-from echelon.runtime.link import Link, draws, link_key
+from echelon.planning.delays import make_table
+from echelon.runtime.ages import AgeCounts
+from echelon.runtime.fates import Fates, draws, link_key
+from echelon.scenario.link_tables import Gamma, Pareto
+from support.links import PunctualLink
 
 MS = 1_000_000
 UNIFORM = LinkPlan(0, 9, Channel.STATE, MS, MS, 3 * MS, 0.1)
@@ -22,9 +27,9 @@ plans = st.builds(
 seeds = st.integers(0, 2**63 - 1)
 
 
-def made(plan: LinkPlan = UNIFORM, seed: int = 1, source: str = "g1/r1", receiver: str = "g1") -> Link:
+def made(plan: LinkPlan = UNIFORM, seed: int = 1, source: str = "g1/r1", receiver: str = "g1") -> PunctualLink:
     """Returns a new link."""
-    return Link(plan, seed, source, receiver)
+    return PunctualLink(plan, seed, source, receiver)
 
 
 GOLDEN_KEY = 0xA54F99E2172065D1A4B24D84B60969A8
@@ -196,10 +201,10 @@ OTHERS = [
 @pytest.mark.parametrize("other", OTHERS)
 def test_links_are_independent(other):
     count = 20_000
-    one = draws(made()._key, 0)
-    assert not np.array_equal(one, draws(other._key, 0))
+    one = draws(made()._fates.key, 0)
+    assert not np.array_equal(one, draws(other._fates.key, 0))
     blocks = range(count // 512)
-    here, there = (np.concatenate([draws(link._key, block) for block in blocks]) for link in (made(), other))
+    here, there = (np.concatenate([draws(link._fates.key, block) for block in blocks]) for link in (made(), other))
     for column in (0, 1):
         assert abs(np.corrcoef(here[:, column], there[:, column])[0, 1]) < 4 / np.sqrt(count)
 
@@ -210,6 +215,78 @@ def test_keys_of_different_links_differ(link, data):
     assume(other != link)
     assert link_key(*link) != link_key(*other)
     assert 0 <= link_key(*link) < 2**128
+
+
+kinds = st.sampled_from(
+    [
+        {},
+        {"delays": make_table(Gamma(kind="gamma", shape=0.7, scale=2e-8))},
+        {"delays": make_table(Pareto(kind="pareto", min=1e-8, shape=1.1, correlation=0.9))},
+        {"delays": DelayTrace((100, LOST, 0, 30), (0, 60, 200, 260))},
+        {"loss": 0.3, "bursts": Bursts(0.1, 0.2, 0.0, 1.0)},
+        {"loss": 0.3, "bursts": Bursts(0.1, 0.2, 0.0, 1.0), "loss_of_message": True},
+        {"blackouts": ((20, 90), (150, 151))},
+    ]
+)
+
+
+@given(plans, kinds, st.sampled_from([0.0, 0.4, 1.0]), st.booleans(), seeds, st.lists(st.integers(0, 400), min_size=1))
+def test_every_message_is_delivered_lost_or_in_flight_on_every_kind_of_link(
+    plain, kind, duplicates, fifo, seed, instants
+):
+    plan = replace(plain, **kind, duplicates=duplicates, fifo=fifo)
+    if plan.delays:
+        plan = replace(plan, delay_min_ns=0, delay_max_ns=max(plan.delays.delays_ns))
+    link, asked = made(plan, seed), Fates(plan, seed, "g1/r1", "g1")
+    for time_ns in sorted(instants):
+        newest, counts = link.newest(time_ns), link.counts()
+        first, second, lost, before = {}, [], 0, 0
+        for number in range(time_ns // plan.period_ns + 1):
+            sent_ns = number * plan.period_ns
+            arrivals = sorted(sent_ns + delay for delay in asked.of(number, sent_ns))
+            if fifo and arrivals:
+                arrivals = [max(before, arrival) for arrival in arrivals]
+                before = arrivals[0]
+            lost += not arrivals
+            first |= {number: arrivals[0]} if arrivals else {}
+            second += arrivals[1:]
+        arrived = [number for number, arrival in first.items() if arrival <= time_ns]
+        assert counts.sent == counts.delivered + counts.lost + counts.in_flight == time_ns // plan.period_ns + 1
+        assert (counts.delivered, counts.lost, newest) == (len(arrived), lost, max(arrived, default=-1))
+        assert counts.duplicates == sum(arrival <= time_ns for arrival in second)
+        if fifo:
+            assert all(link.arrived(number, time_ns) == (number in arrived) for number in range(counts.sent + 2))
+
+
+def test_in_order_nothing_is_overtaken():
+    plan = replace(UNIFORM, delay_min_ns=0, delay_max_ns=20 * MS, loss=0.1, fifo=True)
+    link, delivered = made(plan), 0
+    for time_ns in range(0, 300 * MS, MS // 4):
+        newest, counts = link.newest(time_ns), link.counts()
+        delivered = counts.delivered
+        assert delivered == sum(link.fate(number) is not None for number in range(newest + 1))
+    assert delivered > 200
+
+
+def test_percentiles_are_those_of_the_ages():
+    rng = np.random.default_rng(3)
+    for ages in ([5], [0, 0, 0, 7], list(range(1, 101)), rng.integers(1, 1000, 5000), rng.gamma(2.0, 1e7, 20_000)):
+        link = made()
+        for age in map(int, ages):
+            link.note_use(age + 10, 1, 10)
+        counts = link.counts()
+        found = counts.age_p50_ns, counts.age_p95_ns, counts.age_p99_ns
+        wanted = np.quantile(np.array(ages).astype(int), [0.5, 0.95, 0.99], method="inverted_cdf")
+        assert found == pytest.approx(wanted, rel=0 if len(set(ages)) <= 1024 else 0.004)
+        assert found[2] <= counts.age_max_ns
+    assert made().counts().age_p99_ns == 0
+
+
+def test_many_different_ages_take_little_memory():
+    ages = AgeCounts()
+    for age in np.random.default_rng(1).lognormal(16, 2, 100_000):
+        ages.note(int(age))
+    assert len(ages._counts) < 5000
 
 
 def test_ages_and_holds():

@@ -352,9 +352,9 @@ class Clock:
         return self.now_ns
 
 
-def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int | None], Runner]:
+def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[tuple[int, int | None]], Runner]:
     """Runs a robot's stages on a wall clock.  Command `number` comes `delay_of(number)` [ns] after its instant, or never if
-    that is None.  Returns the number of the command that the robot uses at each instant."""
+    that is None.  Returns when the robot acts, and the number of the command that it then uses."""
     plan, messages = story()
     robot = plan.robots[0]
     start_ns = 1_000_000_000
@@ -364,11 +364,11 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int 
         for number, payload in enumerate(of(messages, robot.parent, Channel.COMMAND))
         if (delay := delay_of(number)) is not None
     ]
-    heard_numbers: list[int | None] = []
+    acts: list[tuple[int, int | None]] = []
 
     def move(time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         message = heard[0]
-        heard_numbers.append(None if message is None else message.sequence)
+        acts.append((time_ns, None if message is None else message.sequence))
         return stages[1].run(time_ns, heard)
 
     role = make_role(plan, robot.index)
@@ -392,33 +392,39 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[int 
         member.runner.wall_clock(start_ns)
     assert member.watched() == member.said
     assert clock.now_ns >= start_ns + plan.duration_ns
-    return plan, heard_numbers, member.runner
+    return plan, acts, member.runner
 
 
-def test_on_a_clock_messages_in_time_are_not_counted_as_late() -> None:
-    plan, numbers, runner = on_the_clock(lambda number: 10)
-    instants = plan.duration_ns // plan.robots[0].period_ns + 1
-    assert numbers == list(range(instants))
+def test_on_a_clock_a_robot_acts_when_a_command_comes() -> None:
+    plan, acts, runner = on_the_clock(lambda number: 10)
+    last, period_ns = plan.duration_ns // plan.robots[0].period_ns, plan.robots[0].period_ns
+    expected: list[tuple[int, int | None]] = []
+    for n in range(last + 1):
+        expected += [(n * period_ns, n - 1 if n else None), (n * period_ns + 10, n)]
+    assert acts == expected[:-1]  # nothing acts after the end of the run
     assert (runner.counts.late, runner.counts.latest_ns) == (0, 0)
-    assert runner.counts.stages == 2 * instants
+    assert runner.counts.stages == 2 * (last + 1)
 
 
 def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
     plan = story()[0]
-    instants = plan.duration_ns // plan.robots[0].period_ns + 1
+    last, period_ns = plan.duration_ns // plan.robots[0].period_ns, plan.robots[0].period_ns
     stopped = range(100, 120)  # the leader stands still, then sends all at once
-    period_ns = plan.robots[0].period_ns
 
     def delay_of(number: int) -> int | None:
         if number == 50:
             return None  # lost
         return (stopped.stop - number) * period_ns + 10 if number in stopped else 10
 
-    _, numbers, runner = on_the_clock(delay_of)
-    wanted: list[int | None] = list(range(instants))
-    wanted[50] = 49
-    wanted[stopped.start : stopped.stop] = [stopped.start - 1] * len(stopped)
-    assert numbers == wanted
+    _, acts, runner = on_the_clock(delay_of)
+    newest: int | None = None
+    expected = []
+    for n in range(last + 1):
+        expected.append((n * period_ns, newest))
+        came = [] if n == 50 or n in stopped else [*stopped, n] if n == stopped.stop else [n]
+        expected += [(n * period_ns + 10, number) for number in came]
+        newest = came[-1] if came else newest
+    assert acts == expected[:-1]
     assert runner.counts.late == 1 + len(stopped)
     assert runner.counts.latest_ns == 0  # stages ran at their deadline, not after it
 

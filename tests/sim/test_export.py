@@ -96,7 +96,8 @@ def test_links_are_one_row_each(run, folder):
     assert found[0] == {
         "source": run.plan.formation[first.source].name, "receiver": run.plan.formation[first.receiver].name,
         "channel": first.channel.name.lower(), "sent": "10", "delivered": "7", "lost": "2", "in_flight": "1",
-        "used": "9", "held": "3", "age_mean": "0.00250000025", "age_max": "0.006",
+        "duplicates": "4", "used": "9", "held": "3", "age_mean": "0.00250000025",
+        "age_p50": "0.002", "age_p95": "0.004", "age_p99": "0.005", "age_max": "0.006",
     }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -121,6 +122,23 @@ def test_lines_end_as_they_did(folder: Path) -> None:
     (result,) = keep_parts(scenario, folder / "out").results
     assert (folder / "out" / "parts.py").read_bytes() == (folder / "parts.py").read_bytes()
     assert result.sha256 == hashlib.sha256((folder / "parts.py").read_bytes()).hexdigest()
+
+
+def test_a_trace_of_delays_is_kept_and_the_run_runs_again_there(folder: Path, tmp_path: Path) -> None:
+    """The trace is called as a file of the run; so it gets another name."""
+    text = "delay\r\n0.02\r\nlost\r\n0.01\r\n"
+    (folder / "can.log").write_bytes(text.encode())
+    rule = 'links=[{channel="state",delay={kind="trace",file="can.log"}}]'
+    out, again = tmp_path / "run", tmp_path / "again"
+    digest = run(folder / "mine.toml", out, "duration=0.5", "claims=[]", rule)
+    (folder / "can.log").unlink()
+    assert (out / "can-2.log").read_bytes() == text.encode()
+    assert tomllib.loads((out / "scenario.toml").read_text())["links"][0]["delay"]["file"] == "can-2.log"
+    assert run(out / "scenario.toml", again) == digest
+    assert read_metadata(out / "run.mcap")["sha256 of can-2.log"] == hashlib.sha256(text.encode()).hexdigest()
+    with (out / "run.mcap").open("rb") as file:
+        (attached,) = [one for one in make_reader(file).iter_attachments() if one.name == "can-2.log"]
+    assert (attached.data.decode(), attached.media_type) == (text, "text/plain")
 
 
 def test_scenarios_of_own_parts_keep_nothing(tmp_path: Path) -> None:

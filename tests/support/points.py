@@ -13,34 +13,47 @@ from echelon.messages import STATE_FIELDS, Channel, Heard, Message
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, Plan
 from echelon.plugins import Part
-from echelon.role import Input, Stage
+from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
 from echelon.sim.engines.in_process import Engine
 from support.growth import growth
 
 
 class PointRobot:
-    """A double integrator as a role."""
+    """A double integrator as a role, which moves when it is asked for its state or told another acceleration."""
 
     def __init__(self, plan: Plan, index: int) -> None:
         robot = plan.robots[index]
         self.index, self._plan = index, robot
-        self.p, self.v = np.array(robot.start), np.zeros(2)
+        self.p, self.v, self.a = np.array(robot.start), np.zeros(2), np.zeros(2)
+        self.said: tuple[float, ...] = ()  # position and velocity at the beginning of its period
+        self._moved_ns = 0
         self._mine = slice(2 * robot.child_number, 2 * robot.child_number + 2)
         self.stages = (
             Stage(Turn.SAY, robot.period_ns, (), self._say),
-            Stage(Turn.ACT, robot.period_ns, (Input(robot.parent, Channel.COMMAND),), self._move),
+            Stage(
+                Turn.ACT,
+                robot.period_ns,
+                (Input(robot.parent, Channel.COMMAND),),
+                self._obey,
+                acts=Acts.ON_ARRIVAL if robot.event_driven else Acts.AT_INSTANT,
+            ),
         )
 
     def _say(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        self._move(time_ns)
         values = np.zeros(len(STATE_FIELDS))
-        values[:4] = *self.p, *self.v
+        values[:4] = self.said = (*self.p, *self.v)
         return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
 
-    def _move(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
-        T, a = self._plan.period_ns * 1e-9, np.zeros(2) if heard[0] is None else heard[0].values[self._mine]
-        self.p, self.v = self.p + T * self.v + T**2 / 2 * a, self.v + T * a
+    def _obey(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        self._move(time_ns)
+        self.a = np.zeros(2) if heard[0] is None else heard[0].values[self._mine]
         return ()
+
+    def _move(self, time_ns: int) -> None:
+        T, self._moved_ns = (time_ns - self._moved_ns) * 1e-9, time_ns
+        self.p, self.v = self.p + T * self.v + T**2 / 2 * self.a, self.v + T * self.a
 
 
 def at_rest(plan: Plan) -> Plan:
@@ -62,10 +75,10 @@ def point_run(plan: Plan, hyperperiods: int, patch: pytest.MonkeyPatch) -> Array
     patch.setattr(echelon.sim.engines.in_process, "make_robot", PointRobot)
     engine = Engine(replace(plan, duration_ns=hyperperiods * period_ns))
     robots = [role for role in engine.roles if isinstance(role, PointRobot)]
-    rows = []
+    rows, scale = [], np.array([1, 1, period_ns * 1e-9, period_ns * 1e-9])
     for time_ns in engine.instants():
         if time_ns % period_ns == 0:
-            rows.append(np.concatenate([np.concatenate([robot.p, period_ns * 1e-9 * robot.v]) for robot in robots]))
+            rows.append(np.concatenate([robot.said * scale for robot in robots]))
             if not np.abs(rows[-1]).max() < 1e100:
                 break
     return np.array(rows)

@@ -115,7 +115,8 @@ def link_counts(plan: Plan) -> list[LinkCounts]:
     """Returns counts for all links of a plan: the first has loss and delay, the others are ideal."""
     ideal = [LinkCounts(link.source, link.receiver, link.channel, 10, 10, 0, 0, 10, 0, 0.0, 0) for link in plan.links]
     first = plan.links[0]
-    ideal[0] = LinkCounts(first.source, first.receiver, first.channel, 10, 7, 2, 1, 9, 3, 2_500_000.25, 6_000_000)
+    ages_ns = 2_500_000.25, 6_000_000, 2_000_000, 4_000_000, 5_000_000
+    ideal[0] = LinkCounts(first.source, first.receiver, first.channel, 10, 7, 2, 1, 9, 3, *ages_ns, duplicates=4)
     return ideal
 
 

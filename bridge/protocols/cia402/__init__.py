@@ -1,17 +1,20 @@
 """CiA 402 over CANopen: a drive for each wheel, cyclic synchronous torque mode."""
 
-from collections.abc import Mapping
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, ClassVar
 
-from echelon.bridge.protocols.frame import Drive, Host
-from echelon.bridge.protocols.observe import Observer
 from echelon.bridge.protocols.protocol import DriveProtocol
-from echelon.plan.can_plan import DrivePlan, EnvelopePlan, MotorPlan
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from cantools.database.can import Message
 
     from echelon.bridge.protocols.cia402.host import Master
+    from echelon.bridge.protocols.frame import Drive, Host
+    from echelon.bridge.protocols.observe import Observer
+    from echelon.plan.can_plan import DrivePlan, EnvelopePlan, MotorPlan
 
 
 class Cia402(DriveProtocol):
@@ -55,19 +58,19 @@ class Cia402(DriveProtocol):
 
         return Cia402Observer(drive, envelope)
 
-    def master(self, period_ns: int, watchdog_ns: int) -> "Master":
+    def master(self, period_ns: int, watchdog_ns: int) -> Master:
         """Returns the master, which sends SYNC and the host's heartbeat."""
         from echelon.bridge.protocols.cia402.host import Master
 
         return Master(period_ns, watchdog_ns)
 
-    def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
+    def messages(self, drive: DrivePlan, name: str) -> list[Message]:
         """Returns PDOs, SDOs, emergency messages and heartbeats of both drives."""
         from echelon.bridge.protocols.cia402.dbc import messages
 
         return messages(drive, name)
 
-    def shared_messages(self, period_ns: int, watchdog_ns: int) -> "list[Message]":
+    def shared_messages(self, period_ns: int, watchdog_ns: int) -> list[Message]:
         """Returns NMT, SYNC, and the host's heartbeat."""
         from echelon.bridge.protocols.cia402.dbc import shared_messages
 

@@ -71,27 +71,31 @@ class CyclicDrive(ABC):
             self.refused[command] += 1
             return frames
         self._heard_ns = time_ns
+        torques, enable, clear, estop = command
         for wheel in (0, 1):
-            if command.estop:
+            if estop:
                 self._fail(time_ns, wheel, Fault.ESTOP)
             else:
-                self._obey(time_ns, wheel, command.enable[wheel], command.torques[wheel], command.clear)
+                self._obey(time_ns, wheel, enable[wheel], torques[wheel], clear)
         return frames
 
     def advance(self, time_ns: int) -> list[Frame]:
         """Lets time pass; returns the feedback that is due by then."""
+        if time_ns == self._now_ns and time_ns < self._feedback_ns and not self._pending and time_ns < self._expires_ns:
+            return []  # this instant is done: several frames may come at one instant
         frames, self._pending = self._pending, []
         if self._now_ns is None:
             period_ns = self.plan.period_ns
             self._feedback_ns = -(-time_ns // period_ns) * period_ns
         while True:
-            at_ns = min(self._feedback_ns, self._expires_ns, time_ns)
+            expires_ns = self._expires_ns
+            at_ns = min(self._feedback_ns, expires_ns, time_ns)
             self._now_ns = at_ns
             for wheel, motor in enumerate(self.motors):
                 fault = motor.advance(at_ns)
                 if fault is not None:
                     self._fail(at_ns, wheel, fault)
-            if self._expires_ns <= at_ns:
+            if expires_ns <= at_ns:
                 for wheel in (0, 1):
                     if self.states[wheel] is WheelState.ENABLED:
                         self._fail(at_ns, wheel, Fault.WATCHDOG)

@@ -27,6 +27,7 @@ SILENT: Final = "silent"
 _DISABLED: Final = (WheelState.DISABLED, WheelState.DISABLED)
 _ENABLED: Final = (WheelState.ENABLED, WheelState.ENABLED)
 _NO_TORQUE: Final = (0.0, 0.0)
+_BOTH: Final = (True, True)
 
 
 class CyclicHost(ABC):
@@ -39,6 +40,8 @@ class CyclicHost(ABC):
         self.torque = _NO_TORQUE
         self.torque_ns: int | None = None
         self.clipped = 0
+        self.enabled = False
+        """True while both wheels take torque, by the last feedback"""
         self._states = _DISABLED  # as last reported
         self._fault = ""
         self._fault_ns = 0  # when the fault was noticed
@@ -59,11 +62,6 @@ class CyclicHost(ABC):
         """Returns the feedback in a data frame with one of `identifiers`, or the reason to refuse it.
 
         Returns None for a valid frame that is no feedback.  Never raises."""
-
-    @property
-    def enabled(self) -> bool:
-        """True while both wheels take torque, by the last feedback."""
-        return self._started and not self._fault and self._states == _ENABLED
 
     @property
     def fault(self) -> str:
@@ -88,12 +86,12 @@ class CyclicHost(ABC):
 
         Raises ValueError for torques that are not finite.
         """
-        if not (isfinite(tau_right) and isfinite(tau_left)):
+        if not isfinite(tau_right + tau_left) and not (isfinite(tau_right) and isfinite(tau_left)):
             raise ValueError(f"torques must be finite, not {tau_right!r} and {tau_left!r}")
         if self.enabled:
-            return self.mirror(tau_right, tau_left, True, saturated)
-        ready = self._started and not self._fault
-        clear = self._clearing_ns is not None
+            # a command at every period of every robot: made in half the time of Command(…)
+            return self.encode(tuple.__new__(Command, ((tau_right, tau_left), _BOTH, False, False)), saturated)
+        ready, clear = self._started and not self._fault, self._clearing_ns is not None
         return self.encode(Command(_NO_TORQUE, (ready, ready), clear, self._estopped), saturated)
 
     def stop(self, time_ns: int) -> list[Frame]:
@@ -111,6 +109,7 @@ class CyclicHost(ABC):
         """Lets the wheels be enabled (again), whatever was wrong before."""
         self._started = self._starts = True
         self._estopped = False
+        self._decide()
 
     def receive(self, time_ns: int, frame: Frame) -> None:
         """Takes a frame from the bus."""
@@ -123,21 +122,25 @@ class CyclicHost(ABC):
                 self._fail(time_ns, _fault_text(heard.faults) or "fault")
             elif self._clearing_ns is not None and time_ns > self._clearing_ns:
                 self._fault, self._clearing_ns = "", None
+            self._decide()
 
     def mirror(self, tau_right: float, tau_left: float, enable: bool, saturated: bool = False) -> list[Frame]:
         """Returns the command for finite wheel torques [N m], whatever the drive reported."""
         torques = (tau_right, tau_left) if enable else _NO_TORQUE
         return self.encode(Command(torques, (enable, enable), False, False), saturated)
 
+    def _decide(self) -> None:
+        self.enabled = self._started and not self._fault and self._states == _ENABLED
+
     def _halt(self) -> None:
-        self._started = False
+        self._started = self.enabled = False
         self._states = _DISABLED
         self._clearing_ns = None
 
     def _fail(self, time_ns: int, text: str) -> None:
         if not self._fault:
             self._fault_ns = time_ns
-        self._fault = text
+        self._fault, self.enabled = text, False
 
 
 def _fault_text(faults: tuple[Fault | None, Fault | None]) -> str:

@@ -1,14 +1,17 @@
 """The native protocol: both wheels of a robot in one frame, with counter and CRC."""
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, ClassVar
 
-from echelon.bridge.protocols.frame import Drive, Host
-from echelon.bridge.protocols.observe import Observer
 from echelon.bridge.protocols.protocol import DriveProtocol
-from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
+
+    from echelon.bridge.protocols.frame import Drive, Host
+    from echelon.bridge.protocols.observe import Observer
+    from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 
 class Native(DriveProtocol):
@@ -47,7 +50,7 @@ class Native(DriveProtocol):
 
         return NativeObserver(drive, envelope)
 
-    def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
+    def messages(self, drive: DrivePlan, name: str) -> list[Message]:
         """Returns the DBC messages of command, feedback and status."""
         from echelon.bridge.protocols.native.dbc import messages
 

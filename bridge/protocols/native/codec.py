@@ -34,10 +34,10 @@ The CRC contains the identifier, so that a robot refuses a frame with a wrong id
 counter are refused. bridge.protocols.cyclic.drive has the states of a wheel.
 """
 
-import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from math import copysign, isfinite
 from typing import NamedTuple
 
 from echelon.bridge.protocols.cyclic import WheelState
@@ -148,7 +148,7 @@ class NativeCodec:
     scale: float
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.scale) and self.scale > 0):
+        if not (isfinite(self.scale) and self.scale > 0):
             raise ValueError(f"torque scale must be positive and finite, not {self.scale!r}")
 
     @property
@@ -175,20 +175,21 @@ class NativeCodec:
         Raises ValueError for a torque that is not finite, or a robot number out of range."""
         if not 0 <= robot < MAX_ROBOTS:
             raise ValueError(f"robot number must be 0 .. {MAX_ROBOTS - 1}, not {robot!r}")
-        if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
+        if not (isfinite(tau_right) and isfinite(tau_left)):
             raise ValueError(f"torques must be finite, not {tau_right!r} and {tau_left!r}")
-        flags, clipped, right, left = 0, 0, 0.0, 0.0
-        if enable[0]:
-            flags, right = ENABLE_RIGHT, tau_right / self.scale
+        flags, clipped, right, left, scale = 0, 0, 0.0, 0.0, self.scale
+        enable_right, enable_left = enable
+        if enable_right:
+            flags, right = ENABLE_RIGHT, tau_right / scale
             if not -RAW_MAX <= right <= RAW_MAX:
                 # a torque that is less than half a bit too large rounds to the limit and is not clipped
                 clipped += abs(right) > RAW_MAX + 0.5
-                right = math.copysign(RAW_MAX, right)
-        if enable[1]:
-            flags, left = flags | ENABLE_LEFT, tau_left / self.scale
+                right = copysign(RAW_MAX, right)
+        if enable_left:
+            flags, left = flags | ENABLE_LEFT, tau_left / scale
             if not -RAW_MAX <= left <= RAW_MAX:
                 clipped += abs(left) > RAW_MAX + 0.5
-                left = math.copysign(RAW_MAX, left)
+                left = copysign(RAW_MAX, left)
         if clipped:
             flags |= CLIPPED
         if saturated:
@@ -258,7 +259,7 @@ def encode_status(status: Status) -> bytes:
     Raises ValueError for a number that is not finite, or a robot number out of range."""
     right, left = status.speeds
     voltage, temperature = status.voltage / VOLTAGE_SCALE, status.temperature - TEMPERATURE_OFFSET
-    if not (math.isfinite(voltage) and math.isfinite(temperature)):
+    if not (isfinite(voltage) and isfinite(temperature)):
         raise ValueError(f"voltage and temperature must be finite, not {status.voltage!r} and {status.temperature!r}")
     return _seal(
         STATUS_ID,
@@ -297,7 +298,7 @@ def frame_id(robot: int, base: int = BASE_ID) -> int:
 
 def _seal(base: int, robot: int, right: float, left: float, byte_4: int, counter: int, byte_6: int) -> bytes:
     start = _START[frame_id(robot, base)]
-    if not (math.isfinite(right) and math.isfinite(left)):
+    if not (isfinite(right) and isfinite(left)):
         raise ValueError(f"wheel numbers must be finite, not {right!r} and {left!r} bits")
     right, left = max(-RAW_MAX, min(RAW_MAX, right)), max(-RAW_MAX, min(RAW_MAX, left))
     body = _BODY.pack(round(right), round(left), byte_4, counter % COUNTERS, byte_6)

@@ -36,14 +36,9 @@ class NativeHost(CyclicHost):
 
     def encode(self, command: Command, saturated: bool) -> list[Frame]:
         """Returns the frame of a command, with the next counter."""
+        (tau_right, tau_left), enable, clear, estop = command
         data, clipped = self._codec.encode(
-            self._robot,
-            *command.torques,
-            self._sent,
-            enable=command.enable,
-            saturated=saturated,
-            clear=command.clear,
-            estop=command.estop,
+            self._robot, tau_right, tau_left, self._sent, enable=enable, saturated=saturated, clear=clear, estop=estop
         )
         self._sent += 1
         self.clipped += clipped

@@ -1,14 +1,17 @@
 """The protocol of ODrive: CANSimple, firmware 0.6, an axis for each wheel, torque control."""
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, ClassVar
 
-from echelon.bridge.protocols.frame import Drive, Host
-from echelon.bridge.protocols.observe import Observer
 from echelon.bridge.protocols.protocol import DriveProtocol
-from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
+
+    from echelon.bridge.protocols.frame import Drive, Host
+    from echelon.bridge.protocols.observe import Observer
+    from echelon.plan.can_plan import DrivePlan, EnvelopePlan
 
 
 class ODrive(DriveProtocol):
@@ -42,7 +45,7 @@ class ODrive(DriveProtocol):
 
         return ODriveObserver(drive, envelope, ODriveConfig() if closed else ODriveConfig(heartbeat_msg_rate_ms=0))
 
-    def messages(self, drive: DrivePlan, name: str) -> "list[Message]":
+    def messages(self, drive: DrivePlan, name: str) -> list[Message]:
         """Returns the vendor's messages for both axes."""
         from echelon.bridge.protocols.odrive.dbc import messages
 

@@ -162,9 +162,16 @@ def test_six_milliseconds_of_delay_settle_and_seven_do_not():
     np.testing.assert_allclose(peaks[3:10] / peaks[2:9], pace, rtol=0.02)
 
 
-def test_a_delay_between_two_ticks_is_that_of_the_later():
-    between, later = (run(["duration=0.1", late(delay)]).digest() for delay in (0.0055, 0.006))
-    assert between == later != run(["duration=0.1", late(0.005)]).digest()
+def test_a_delay_between_two_ticks_is_that_of_the_later_where_nodes_are_time_driven():
+    """Time-driven nodes act at their own instants; event-driven ones when a message arrives."""
+    timed, between, later = "timing='time_driven'", late(0.0055), late(0.006)
+    assert run(["duration=0.1", timed, between]).digest() == run(["duration=0.1", timed, later]).digest()
+    assert run(["duration=0.1", timed, later]).digest() != run(["duration=0.1", timed, late(0.005)]).digest()
+    assert run(["duration=0.1", between]).digest() != run(["duration=0.1", later]).digest()
+
+
+def test_without_delay_and_loss_the_timing_does_not_matter():
+    assert run(["duration=0.05"]).digest() == run(["duration=0.05", "timing='time_driven'"]).digest()
 
 
 def test_instants_are_all_multiples_of_the_period_to_the_end():

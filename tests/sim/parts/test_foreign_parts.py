@@ -107,14 +107,15 @@ def one_line(err: str) -> str:
         ("raise ValueError('first\\nsecond')", "raised ValueError: first\\nsecond"),
         ("return None", {"plant": "must return a RobotState", "path": "has the shape ()", "law": "returned nothing"}),
         ("return [1.0]", {"plant": "must return a RobotState", "path": "has the shape (1,)", "law": "has the shape (1,)"}),
-        (HANG, "takes longer than 2 s"),
+        (HANG, "takes longer than 0.5 s"),
         ("while True:\n            try:\n                pass\n            except Exception:\n                pass", "longer"),
     ],
     ids=["raises", "two lines", "nothing", "shape", "hangs", "hangs and swallows"],
 )  # fmt: skip
 def test_a_part_that_fails_at_once_is_a_mistake_in_the_scenario(
-    folder: Path, kind: str, line: str, says: str | dict[str, str]
+    folder: Path, kind: str, line: str, says: str | dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("echelon.sim.parts.probe.PATIENCE_S", 0.5)
     use = write(folder, kind, line)
     begun = time.monotonic()
     with pytest.raises(ScenarioError) as caught:

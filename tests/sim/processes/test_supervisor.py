@@ -12,7 +12,9 @@ from subprocess import Popen
 
 import pytest
 
+from echelon.messages import Channel
 from echelon.plan.plan import Plan
+from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import parse
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.failures import NAMED, few
@@ -33,6 +35,15 @@ from support.runs import (
 )
 
 LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
+EVERY_KIND = (
+    'links=[{name="up",channel="state",delay={kind="gamma",shape=2.0,scale=0.004,correlation=0.9},loss={mean=0.2,burst=3.0}},'
+    '{name="down",channel="command",delay={kind="normal",mean=0.01,std=0.01},loss=0.2,loss_of="message",duplicates=0.3,policy="zero",timeout=0.05},'
+    '{channel="group_state",delay={kind="pareto",min=0.002,shape=1.5},order="fifo",policy="hold_then_stop",timeout=0.04},'
+    '{channel="reference",delay={kind="trace",file="TRACE",by="time"}}]',
+    'events=[{kind="blackout",at=0.1,duration=0.05,link="down"},{kind="cut_off",at=0.2,duration=0.05,member="g1"}]',
+    "robot.clock={offset=0.003,drift=1e-4}",
+)
+"""Links of every kind but the plain ones; `TRACE` stands for a file"""
 LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0},{channel="reference",loss=1.0}]'
 SHORT = "duration=0.3"
 TWENTY = """
@@ -80,6 +91,37 @@ def test_processes_give_the_trace_of_one_process(tmp_path: Path, links: tuple[st
     assert outcome.failure is None
     assert outcome.trace.digest() == expected
     assert read_trace(tmp_path / "run.mcap", plan).digest() == expected
+
+
+def test_links_of_every_kind_do_the_same_between_processes(tmp_path: Path) -> None:
+    trace = tmp_path / "delays.csv"
+    trace.write_text("time,delay\n0,0.011\n0.12,lost\n0.2,0.003\n")
+    plan = plan_of("lab", "duration=0.5", *(text.replace("TRACE", str(trace)) for text in EVERY_KIND))
+    engine = Engine(plan, lambda message: None)
+    engine.run()
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+    counts = sorted(outcome.links, key=lambda link: (link.receiver, link.source, link.channel))
+    assert counts == sorted(engine.link_counts(), key=lambda link: (link.receiver, link.source, link.channel))
+    of_channel = {
+        channel: [link for link in counts if link.channel is channel] for channel in {link.channel for link in counts}
+    }
+    for links in of_channel.values():
+        assert sum(link.lost for link in links)
+        assert all(link.sent == link.delivered + link.lost + link.in_flight for link in links)
+    assert sum(link.duplicates for link in of_channel[Channel.COMMAND])
+
+
+def test_links_are_told_while_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of("lab", "duration=4.0", 'links=[{channel="state",loss=0.5}]')
+    seen: list[int] = []
+    outcome = supervised(
+        plan, tmp_path, show=lambda progress: seen.append(sum(each.sent for each in progress.links.values()))
+    )
+    assert outcome.failure is None
+    assert seen[-1] <= sum(link.sent for link in outcome.links)
+    assert max(seen) > 0
 
 
 def test_order_of_start_does_not_matter(tmp_path: Path) -> None:

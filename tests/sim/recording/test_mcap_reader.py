@@ -21,7 +21,7 @@ from echelon.sim.results.trace import TraceBuilder
 from support.invented import METADATA, invented, paper
 
 SCENARIO = 'name = "µ"\r\n'
-LINKS = [LinkCounts(0, 9, Channel.STATE, 21, 20, 1, 0, 20, 2, 1.5e6 / 7, 3_000_000)]
+LINKS = [LinkCounts(0, 9, Channel.STATE, 21, 20, 1, 0, 20, 2, 1.5e6 / 7, 3_000_000, 1, 2, 3, 4)]
 TICKS = 60
 
 

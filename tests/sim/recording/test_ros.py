@@ -274,12 +274,23 @@ def test_can_frame(time_ns: int, can_id: int, data: bytes, remote: bool) -> None
     assert ros.can_frame(ros.stamp(time_ns), can_id, data, remote) == serialized("can_msgs/Frame", message)
 
 
-@given(times, names, st.tuples(*[st.integers(0, 2**63)] * 6), numbers, st.integers(0, 2**62))
+@given(
+    times,
+    names,
+    st.tuples(*[st.integers(0, 2**63)] * 6),
+    numbers,
+    st.tuples(*[st.integers(0, 2**62)] * 4),
+    st.integers(0, 2**63),
+)
 def test_link_statistics(
-    time_ns: int, name: str, counts: tuple[int, int, int, int, int, int], mean: float, worst: int
+    time_ns: int,
+    name: str,
+    counts: tuple[int, int, int, int, int, int],
+    mean: float,
+    ages: tuple[int, int, int, int],
+    duplicates: int,
 ) -> None:
-    message = make(
-        "echelon_msgs/LinkStatistics", header(time_ns, ""), 3, 4, int(Channel.COMMAND), name, *counts, mean, worst
-    )
-    encoded = ros.link_statistics(time_ns, LinkCounts(3, 4, Channel.COMMAND, *counts, mean, worst), name)
+    values = *counts, mean, *ages, duplicates
+    message = make("echelon_msgs/LinkStatistics", header(time_ns, ""), 3, 4, int(Channel.COMMAND), name, *values)
+    encoded = ros.link_statistics(time_ns, LinkCounts(3, 4, Channel.COMMAND, *values), name)
     assert encoded == serialized("echelon_msgs/LinkStatistics", message)

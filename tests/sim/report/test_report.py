@@ -24,6 +24,7 @@ from echelon.sim.report.drawing import COLUMNS, thin
 from echelon.sim.report.report import write_report
 from echelon.sim.report.run_for_report import RunForReport
 from echelon.sim.results.summary import summarise
+from echelon.sim.results.tables import AGE_KEYS
 from echelon.sim.results.trace import Trace
 from echelon.sim.results.verdict import count
 from support.synthetic import FIELD, PERIOD_NS, Run, can_report, decaying, link_counts, run_facts
@@ -273,10 +274,10 @@ def test_runs_that_went_wrong_are_drawn_as_far_as_they_go(run, tmp_path):
 
 def test_a_link_over_which_nothing_was_used_has_no_ages(run, tmp_path):
     one = for_report(run, "run")
-    unused = replace(one.summary.links[0], used=0, age_mean=None, age_max=None)
+    unused = replace(one.summary.links[0], used=0, **dict.fromkeys(AGE_KEYS))
     page = rendered([replace(one, summary=replace(one.summary, links=(unused,)))], tmp_path / "report.html")
-    counts = f"{unused.sent} {unused.lost} {unused.in_flight} {unused.held}"
-    assert f"{unused.source} → {unused.receiver} {unused.channel} {counts} – –" in page.text
+    counts = f"{unused.sent} {unused.lost} {unused.in_flight} {unused.duplicates} {unused.held}"
+    assert f"{unused.source} → {unused.receiver} {unused.channel} {counts} – – – – –" in page.text
 
 
 def test_a_report_needs_a_run(tmp_path):

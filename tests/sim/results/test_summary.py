@@ -262,6 +262,8 @@ def test_links_and_what_is_passed_in_are_fit_for_json(run, summary):
     assert first["source"] == run.plan.formation[run.plan.links[0].source].name
     assert first["sent"] == first["delivered"] + first["lost"] + first["in_flight"]
     assert (first["age_mean"], first["age_max"]) == (0.00250000025, 0.006)
+    assert (first["age_p50"], first["age_p95"], first["age_p99"]) == (0.002, 0.004, 0.005)
+    assert first["duplicates"] == 4
     assert second["held"] == 0
     assert (summary["can"]["frames"], summary["can"]["load_mean"], summary["can"]["timing"]) == (12, 0.25, None)
     assert summary["run"]["real_time_factor"] == 2.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from echelon.bridge.reports import BridgeProgress
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
-from echelon.messages import STATE_FIELDS
+from echelon.messages import STATE_FIELDS, Channel
+from echelon.runtime.link import LinkCounts
 from echelon.sim.processes.outcome import Progress
 from echelon.sim.view import live
 from echelon.sim.view.live import Display
@@ -90,6 +92,27 @@ def test_a_table_in_a_terminal() -> None:
     assert "centroid" in text
     display.say("after")
     assert stream.getvalue().endswith("after\n")
+
+
+def test_the_table_has_the_links_if_they_are_late() -> None:
+    rules = 'links=[{name="up",channel="state",delay=0.02},{channel="command",loss=0.1}]'
+    plan = plan_of("paper", rules)
+    progress = progress_with({})
+    progress.hear_links(
+        LinkCounts(
+            link.source, link.receiver, link.channel, 100, 70, 20, 10, 60, 5, 1e6, 80_000_000, 1, 2, 40_000_000, 3
+        )
+        for link in plan.links
+        if link.channel is Channel.COMMAND or link.name
+    )
+    for shown, there in ((plan, True), (PLAN, False)):
+        stream = Terminal()
+        display = Display(shown, stream)
+        display.show(progress)
+        display.close()
+        text = " ".join(re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue()).split())
+        for name in ("up", "command"):
+            assert (f"{name} 900 180 90 27 1e-09 2e-09 0.04 0.08" in text) == there
 
 
 def test_quiet_in_a_terminal_leaves_it_alone() -> None:

@@ -4,17 +4,19 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echelon.errors import UsageError
 from echelon.plan.plan import Plan
-from echelon.runtime.link import link_key
+from echelon.runtime.fates import ALL, link_key
 from echelon.sim.batch.model import ModelMaker, refusal
 from echelon.sim.batch.outcomes import TRACED, BatchRuns, Kept, outcomes
 
-MOST_AT_ONCE = 16
+_WORD: Final = 2**64 - 1
+MOST_AT_ONCE: Final = 16
 """Largest number of runs that a thread takes at once"""
 
 
@@ -73,13 +75,14 @@ def run_many(
 
 
 def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.int64]:
-    """Returns the bits of the Philox key of each link for each seed, (seeds, links, 2); zero for ideal links, which draw
-    nothing."""
+    """Returns the bits of the Philox keys of each link for each seed, (seeds, links, 4): that of the link, and that of losses
+    for all receivers; zero for links that draw nothing."""
     names = [one.name for one in plan.all_roles]
-    keys = np.zeros((len(seeds), max(1, len(plan.links)), 2), dtype=np.uint64)
-    lossy = [(at, link) for at, link in enumerate(plan.links) if not link.ideal]
+    keys = np.zeros((len(seeds), max(1, len(plan.links)), 4), dtype=np.uint64)
+    drawing = [(at, link) for at, link in enumerate(plan.links) if not link.prompt]
     for row, seed in enumerate(seeds):
-        for at, link in lossy:
+        for at, link in drawing:
             key = link_key(seed, names[link.source], names[link.receiver], link.channel)
-            keys[row, at] = key & (2**64 - 1), key >> 64
+            of_loss = link_key(seed, names[link.source], ALL, link.channel) if link.loss_of_message else 0
+            keys[row, at] = key & _WORD, key >> 64, of_loss & _WORD, of_loss >> 64
     return keys.view(np.int64)

@@ -15,8 +15,9 @@ from echelon.controller.trajectory import Circle, Line, Sine, Waypoints
 from echelon.controller.transformation import desired_shape
 from echelon.messages import Channel
 from echelon.plan.layout import NodeLayout, acceleration_of, length
-from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, RobotPlan
+from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan
 from echelon.sim.batch import records as r
+from echelon.sim.batch.links import fates_of
 from echelon.sim.batch.outcomes import fractions
 from echelon.sim.batch.pools import Pools, records_of
 from echelon.sim.batch.robots import motion_of
@@ -31,10 +32,11 @@ KINDS: Final = {
 
 _LINK: Final = frozenset({
     "source", "receiver", "channel", "period_ns", "delay_min_ns", "delay_max_ns", "loss", "timeout_ns", "first_ns", "size",
-    "name", "policy", "punctual",
+    "punctual", "name", "policy", "delays", "bursts", "loss_of_message", "duplicates", "fifo", "blackouts", "source_clock",
+    "receiver_clock",
 })  # fmt: skip
 """What this engine knows of a link"""
-_POLICIES: Final = ("hold", "hold_then_stop")
+_POLICIES: Final = ("hold", "hold_then_stop", "zero")
 
 
 def refusal(plan: Plan) -> str | None:
@@ -53,13 +55,8 @@ def _reasons(plan: Plan) -> Iterator[str]:
         for field in fields(link):
             if field.name not in _LINK and getattr(link, field.name) != field.default:
                 yield f"links: the batch engine does not know {field.name}"
-        if getattr(link, "policy", "hold") not in _POLICIES:
-            yield f"links: the batch engine knows the policies {' and '.join(_POLICIES)} only"
-
-
-def _is_prompt(link: LinkPlan) -> bool:
-    """True if each message is in use from its nominal instant on."""
-    return bool(getattr(link, "prompt", link.ideal))
+        if link.policy not in _POLICIES:
+            yield f"links: the batch engine knows the policies {', '.join(_POLICIES)} only"
 
 
 class ModelMaker:
@@ -105,7 +102,7 @@ class ModelMaker:
         """Returns how many messages of a stream are kept: a power of two, above those in flight at any time."""
         most = 1
         for link in self.plan.links:
-            if (link.source, link.channel) == (source, channel) and not _is_prompt(link):
+            if (link.source, link.channel) == (source, channel) and not link.prompt:
                 # A message may be sent a period late, and is asked for a period of the receiver later.
                 asked_ns = self.plan.formation[link.receiver].period_ns
                 most = max(most, (link.delay_max_ns + asked_ns) // link.period_ns + 4)
@@ -127,7 +124,7 @@ class ModelMaker:
     def _link(self, at: int, stream: Mapping[str, Any]) -> dict[str, Any]:
         link, pools = self.plan.links[at], self.pools
         parts = self._parts(at)
-        size = 0 if _is_prompt(link) else max(first + count for first, count in parts)
+        size = 0 if link.prompt else max(first + count for first, count in parts)
         shift = (
             parts[0][0] if len(parts) == 1 and size else 0
         )  # of a long message that one part of is used, keep only that
@@ -136,15 +133,12 @@ class ModelMaker:
             "mask": stream["mask"],
             "stream_at": stream["at"],
             "stream_marks_at": stream["marks_at"],
-            "prompt": _is_prompt(link),
-            "delay_min_ns": link.delay_min_ns,
-            "delay_span_ns": link.delay_max_ns - link.delay_min_ns,
+            "prompt": link.prompt,
             "timeout_ns": link.timeout_ns,
             "at": pools.real(size - shift) - shift,
-            "draws_at": pools.real(0 if _is_prompt(link) else 4),
-            "marks_at": pools.whole(r.LINK_WHOLES + (0 if _is_prompt(link) else stream["mask"] + 1)),
-            "loss": link.loss,
-        }
+            "zeros_at": pools.real(stream["size"]) if link.policy == "zero" else -1,
+            "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
+        } | fates_of(link, pools)
         for number, (first, count) in enumerate(parts, start=1):
             record |= {f"first_{number}": first, f"size_{number}": count}
         return record
@@ -166,8 +160,7 @@ class ModelMaker:
 
     def _robot(self, robot: RobotPlan) -> dict[str, Any]:
         return motion_of(robot) | {
-            "on_arrival": getattr(robot, "event_driven", False)
-            and not all(map(_is_prompt, self.plan.links_into(robot.index))),
+            "on_arrival": robot.event_driven and not all(link.prompt for link in self.plan.links_into(robot.index)),
             "at": self.pools.real(r.ROBOT_REALS),
             "stream": self._streams[robot.index, Channel.STATE],
             "link": self._links[robot.parent, robot.index, Channel.COMMAND],
@@ -184,8 +177,7 @@ class ModelMaker:
         return {
             "period_ns": node.period_ns,
             "parent_period_ns": 1 if parent is None else parent.period_ns,
-            "when_heard": getattr(node, "event_driven", False)
-            and not all(map(_is_prompt, plan.links_into(node.index))),
+            "when_heard": node.event_driven and not all(link.prompt for link in plan.links_into(node.index)),
             "count": count,
             "robots": node.robots,
             "links_at": pools.index(links),

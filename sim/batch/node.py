@@ -19,14 +19,14 @@ def gather(
     time_ns = due_ns
     if node.when_heard:
         for child in range(count):
-            take_up(links[index[node.links_at + child]], real, whole)
+            take_up(links[index[node.links_at + child]], index, whole)
         time_ns, last_ns = max(due_ns, whole[node.acted_at]), _last_ns(node, run, due_ns)
         for child in range(count):
             time_ns = heard_ns(links[index[node.links_at + child]], whole, time_ns, last_ns)
     whole[node.acted_at] = time_ns
     complete = 1
     for child in range(count):
-        said = hear(links[index[node.links_at + child]], real, whole, time_ns)
+        said = hear(links[index[node.links_at + child]], index, real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -92,13 +92,13 @@ def steer(
     """Takes the parent's reference in the period from `due_ns` on; sends REFERENCE and COMMAND to the children."""
     time_ns = whole[node.acted_at]
     if node.when_heard and node.link >= 0:
-        take_up(links[node.link], real, whole)
+        take_up(links[node.link], index, whole)
         time_ns = heard_ns(links[node.link], whole, time_ns, _last_ns(node, run, due_ns))
         whole[node.acted_at] = time_ns
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
-        said = hear(links[node.link], real, whole, time_ns)
+        said = hear(links[node.link], index, real, whole, time_ns)
         if said < 0:
             complete = 0
         else:

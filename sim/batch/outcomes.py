@@ -30,7 +30,7 @@ ROBOT_FIELDS: Final = np.dtype(
     [(name, "f8") for name in ("rms", "peak", "saturation_share", "saturated_after_first_second")]
 )
 LINK_FIELDS: Final = np.dtype(
-    [(name, "i8") for name in ("sent", "delivered", "lost", "in_flight", "used", "held")]
+    [(name, "i8") for name in ("sent", "delivered", "lost", "in_flight", "duplicates", "used", "held")]
     + [(name, "f8") for name in ("age_mean", "age_max")]
 )
 
@@ -201,10 +201,11 @@ def _robots(plan: Plan, of_robots: NDArray[np.float64]) -> Records:
 
 
 def _links(plan: Plan, of_links: NDArray[np.int64]) -> Records:
-    sent, delivered, lost, used, held, age_sum, age_max = np.moveaxis(of_links, 2, 0)
-    prompt = np.array([getattr(link, "prompt", link.ideal) for link in plan.links], dtype=bool)
+    sent, delivered, lost, duplicates, used, held, age_sum, age_max = np.moveaxis(of_links, 2, 0)
+    prompt = np.array([link.prompt for link in plan.links], dtype=bool)
     links = np.zeros(sent.shape, dtype=LINK_FIELDS)
     links["sent"], links["lost"], links["used"], links["held"] = sent, lost, used, held
+    links["duplicates"] = duplicates
     links["delivered"] = np.where(prompt, sent, delivered)
     links["in_flight"] = sent - lost - links["delivered"]
     links["age_mean"] = np.where(used > 0, age_sum / np.maximum(used, 1) / 1e9, np.nan)

@@ -13,8 +13,6 @@ _M_0: Final = np.uint64(0xD2E7470EE14C6C93)
 _M_1: Final = np.uint64(0xCA5A826395121157)
 _W_0: Final = np.uint64(0x9E3779B97F4A7C15)
 _W_1: Final = np.uint64(0xBB67AE8584CAA73B)
-_DROPPED: Final = np.uint64(11)
-_UNIT: Final = 2.0**-53
 
 
 @compiled
@@ -27,17 +25,13 @@ def high(a: np.uint64, b: np.uint64) -> np.uint64:
 
 
 @compiled
-def philox(key_0: np.uint64, key_1: np.uint64, counter: np.uint64) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Returns the four words of a counter below 2^64."""
-    a, b, c, d = counter, np.uint64(0), np.uint64(0), np.uint64(0)
+def philox(
+    key_0: np.uint64, key_1: np.uint64, counter: np.uint64, stream: np.uint64
+) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
+    """Returns the four words of a counter whose lowest 64 bits are `counter`, and whose highest are `stream`."""
+    a, b, c, d = counter, np.uint64(0), np.uint64(0), stream
     for _ in range(10):
         a, b, c, d = high(_M_1, c) ^ b ^ key_0, _M_1 * c, high(_M_0, a) ^ d ^ key_1, _M_0 * a
         key_0 += _W_0
         key_1 += _W_1
     return a, b, c, d
-
-
-@compiled
-def uniform(word: np.uint64) -> float:
-    """Returns a word as a number in [0, 1), a multiple of 2^-53."""
-    return float(word >> _DROPPED) * _UNIT

@@ -13,6 +13,7 @@ class Pools:
     def __init__(self) -> None:
         self._table: list[float] = []
         self._index: list[int] = []
+        self._shared: dict[tuple[int, ...], int] = {}
         self.reals = self.wholes = 0
 
     def table(self, values: Any) -> int:
@@ -24,6 +25,12 @@ class Pools:
         """Returns the place of integers."""
         self._index += values
         return len(self._index) - len(values)
+
+    def shared(self, values: tuple[int, ...]) -> int:
+        """Returns the place of integers that several have in common."""
+        if values not in self._shared:
+            self._shared[values] = self.index(values)
+        return self._shared[values]
 
     def real(self, count: int) -> int:
         """Returns the place of scratch for floats."""

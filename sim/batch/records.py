@@ -61,11 +61,13 @@ STREAM: Final = _record(
     "",
 )
 LINK: Final = _record(
-    # its stream, as above; `at`: the message in use in `real`; `draws_at`: draws of two messages; places and sizes of the parts
-    # that the receiver uses of a message
-    "size mask stream_at stream_marks_at prompt delay_min_ns delay_span_ns timeout_ns at draws_at marks_at "
-    "first_1 size_1 first_2 size_2 first_3 size_3",
-    "loss",
+    # its stream, as above; `at`: the message in use in `real`, `zeros_at`: what is used where it is too old (policy `zero`);
+    # places and sizes of the parts that the receiver uses of a message
+    "size mask stream_at stream_marks_at prompt timeout_ns at zeros_at marks_at first_1 size_1 first_2 size_2 first_3 size_3 "
+    # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
+    "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
+    "bursts loss_of_message fifo source_offset_ns receiver_offset_ns",
+    "loss duplicates to_bad to_good share_bad loss_good loss_bad source_drift receiver_drift",
 )
 
 PAPER, BODY = 0, 1
@@ -85,12 +87,17 @@ S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(15, 21)
 """The same of all periods so far, squares as means; those after the first second; number of periods"""
 ROBOT_REALS: Final = 21
 
+DRAWN, TABLE, TABLE_Z, BY_NUMBER, BY_TIME = range(5)
+"""`LINK.kind`: uniform, a table of independent or of correlated delays, a trace"""
+
 # Places in a link's part of `whole`.
-TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, USED, HELD, AGE_SUM, AGE_MAX, NEXT, NEWEST, OLDEST = range(14)
-KEY_0, KEY_1 = 14, 15
-LINK_WHOLES: Final = 16
-"""After these come the arrivals of the messages in flight [ns]"""
-COUNTS: Final = (TAKEN, DELIVERED, LOST, USED, HELD, AGE_SUM, AGE_MAX)
+TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX = range(12)
+NEXT, NEWEST, OLDEST, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 22)
+F_OWN, F_LOSS, F_COPY, F_BURST = 22, 26, 30, 34
+"""Draws of two messages"""
+LINK_WHOLES: Final = 38
+"""After these come the arrivals of the messages in flight [ns], then those of their second copies"""
+COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX)
 """What of these is a result"""
 GONE: Final = -1
 """Arrival of a message that was delivered or lost"""

@@ -1,25 +1,22 @@
 """Messages between roles: what a role says, what becomes of it on the way, and what its receiver uses
 (echelon.runtime.link and mailbox, as arrays)."""
 
-from math import floor
 from typing import Any
 
-import numpy as np
-
 from echelon.sim.batch.compiled import compiled
-from echelon.sim.batch.philox import philox, uniform
+from echelon.sim.batch.fates import fates, rounded
 from echelon.sim.batch.records import (
     AGE_MAX,
     AGE_SUM,
     DELIVERED,
+    DUPLICATES,
     FAR,
     GONE,
     HELD,
     IN_USE,
     IS_NULL,
-    KEY_0,
-    KEY_1,
     LAST,
+    LATEST,
     LINK_WHOLES,
     LOST,
     NEWEST,
@@ -48,7 +45,7 @@ def say(stream: Any, whole: Any, time_ns: int, is_null: int) -> None:
 
 
 @compiled
-def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
+def hear(link: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
     """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
     use.  Must be called with ascending instants."""
     marks = link.marks_at
@@ -56,17 +53,18 @@ def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
         number = whole[link.stream_marks_at] - 1
         whole[marks + TAKEN] = number + 1
         mark = link.stream_marks_at + 1 + 2 * (number & link.mask)
-        stamp, is_null = whole[mark], whole[mark + 1]
+        whole[marks + STAMP], whole[marks + IS_NULL] = whole[mark], whole[mark + 1]
         place = link.stream_at + (number & link.mask) * link.size
     else:
-        take_up(link, real, whole)
+        take_up(link, index, whole)
         receive(link, whole, time_ns)
         _use(link, real, whole)
-        number, stamp, is_null = whole[marks + IN_USE], whole[marks + STAMP], whole[marks + IS_NULL]
-        place = link.at
-    age = time_ns - stamp
-    if number < 0 or is_null or age > link.timeout_ns:
+        number, place = whole[marks + IN_USE], link.at
+    if number < 0 or whole[marks + IS_NULL]:
         return -1
+    age = time_ns - whole[marks + STAMP]
+    if link.timeout_ns < FAR and read_age_ns(link, time_ns, whole[marks + STAMP]) > link.timeout_ns:
+        return int(link.zeros_at)
     whole[marks + USED] += 1
     if age != 0:
         if number == whole[marks + LAST]:
@@ -79,52 +77,34 @@ def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
 
 
 @compiled
-def take_up(link: Any, real: Any, whole: Any) -> None:
+def read_age_ns(link: Any, time_ns: int, sent_ns: int) -> int:
+    """Returns the age that the receiver reads at `time_ns` off a message sent at `sent_ns`, by the clocks of both."""
+    shown_ns = link.receiver_offset_ns - link.source_offset_ns + rounded(link.receiver_drift * time_ns)
+    return int(time_ns - sent_ns + shown_ns - rounded(link.source_drift * sent_ns))
+
+
+@compiled
+def take_up(link: Any, index: Any, whole: Any) -> None:
     """Draws what becomes of the messages that were sent since the last call."""
     if link.prompt:
         return
     marks = link.marks_at
-    number = whole[marks + TAKEN]
+    number, arrivals, copies = whole[marks + TAKEN], marks + LINK_WHOLES, marks + LINK_WHOLES + link.mask + 1
     while number < whole[link.stream_marks_at]:
-        sent_ns = whole[link.stream_marks_at + 1 + 2 * (number & link.mask)]
-        delay_ns = fate(link, number, real, whole)
-        arrival = marks + LINK_WHOLES + (number & link.mask)
-        if delay_ns < 0:
+        sent_ns, slot = whole[link.stream_marks_at + 1 + 2 * (number & link.mask)], number & link.mask
+        first, second = fates(link, number, sent_ns, index, whole)
+        whole[arrivals + slot] = whole[copies + slot] = GONE
+        if first == GONE:
             whole[marks + LOST] += 1
-            whole[arrival] = GONE
         else:
-            whole[arrival] = sent_ns + delay_ns
-            whole[marks + NEXT] = min(whole[marks + NEXT], sent_ns + delay_ns)
+            whole[arrivals + slot] = max(sent_ns + first, whole[marks + LATEST]) if link.fifo else sent_ns + first
+            whole[marks + NEXT] = min(whole[marks + NEXT], whole[arrivals + slot])
+        if second != GONE:
+            whole[copies + slot] = max(sent_ns + second, whole[marks + LATEST]) if link.fifo else sent_ns + second
+        if first != GONE:
+            whole[marks + LATEST] = whole[arrivals + slot]
         number += 1
     whole[marks + TAKEN] = number
-
-
-@compiled
-def fate(link: Any, number: int, real: Any, whole: Any) -> int:
-    """Returns the delay of a message [ns], or -1 if it is lost.  Must be called with ascending numbers from 0 on."""
-    draws = link.draws_at
-    if (
-        number % 2 == 0
-    ):  # each count of the generator has two words for each of two messages; numpy's counts begin with 1
-        key_0, key_1 = np.uint64(whole[link.marks_at + KEY_0]), np.uint64(whole[link.marks_at + KEY_1])
-        a, b, c, d = philox(key_0, key_1, np.uint64(number // 2 + 1))
-        real[draws] = uniform(a)
-        real[draws + 1] = uniform(b)
-        real[draws + 2] = uniform(c)
-        real[draws + 3] = uniform(d)
-    else:
-        draws += 2
-    if real[draws] < link.loss:
-        return -1
-    return int(link.delay_min_ns) + _rounded(real[draws + 1] * link.delay_span_ns)
-
-
-@compiled
-def _rounded(value: float) -> int:
-    """Returns the nearest integer of a value that is not negative; the even one of two."""
-    below = floor(value)
-    rest = value - below
-    return below + int(rest > 0.5 or (rest == 0.5 and below % 2 == 1))
 
 
 @compiled
@@ -138,6 +118,13 @@ def receive(link: Any, whole: Any, time_ns: int) -> None:
     oldest = max(whole[marks + OLDEST], taken - link.mask - 1)  # what is older has arrived or is lost
     for number in range(oldest, taken):
         arrival = arrivals + (number & link.mask)
+        if link.duplicates > 0.0:
+            copy = arrival + link.mask + 1
+            if whole[copy] != GONE and whole[copy] <= time_ns:
+                whole[copy] = GONE
+                whole[marks + DUPLICATES] += 1
+            elif whole[copy] != GONE:
+                next_ns = min(next_ns, whole[copy])
         if whole[arrival] == GONE:
             continue
         if whole[arrival] <= time_ns:
@@ -146,7 +133,11 @@ def receive(link: Any, whole: Any, time_ns: int) -> None:
             whole[marks + NEWEST] = max(whole[marks + NEWEST], number)
         else:
             next_ns = min(next_ns, whole[arrival])
-    while oldest < taken and whole[arrivals + (oldest & link.mask)] == GONE:
+    while (
+        oldest < taken
+        and whole[arrivals + (oldest & link.mask)] == GONE
+        and whole[arrivals + link.mask + 1 + (oldest & link.mask)] == GONE
+    ):
         oldest += 1
     whole[marks + OLDEST] = oldest
     whole[marks + NEXT] = next_ns
@@ -189,10 +180,25 @@ def change_ns(link: Any, whole: Any, time_ns: int) -> int:
     marks = link.marks_at
     change = _next_arrival_ns(link, whole)
     if link.timeout_ns < FAR and whole[marks + IN_USE] >= 0 and whole[marks + IS_NULL] == 0:
-        expires_ns = whole[marks + STAMP] + link.timeout_ns + 1
+        expires_ns = _expires_ns(link, whole[marks + STAMP])
         if expires_ns > time_ns:
             change = min(change, expires_ns)
     return int(change)
+
+
+@compiled
+def _expires_ns(link: Any, sent_ns: int) -> int:
+    """Returns the first instant at which a receiver finds a message too old that was sent at `sent_ns`."""
+    expires_ns = sent_ns + link.timeout_ns + 1
+    lacking_ns = link.timeout_ns + 1 - read_age_ns(link, expires_ns, sent_ns)
+    while lacking_ns > 0:
+        expires_ns += lacking_ns
+        lacking_ns = link.timeout_ns + 1 - read_age_ns(link, expires_ns, sent_ns)
+    over_ns = read_age_ns(link, expires_ns - 1, sent_ns) - link.timeout_ns
+    while over_ns > 0:
+        expires_ns -= over_ns
+        over_ns = read_age_ns(link, expires_ns - 1, sent_ns) - link.timeout_ns
+    return int(expires_ns)
 
 
 @compiled

@@ -13,7 +13,6 @@ from echelon.sim.batch.records import (
     HELD_S,
     IN_USE,
     KEY_0,
-    KEY_1,
     LAST,
     M_FINITE,
     NEWEST,
@@ -49,7 +48,7 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
     """Runs a plan; returns the instant at which a robot's state is not finite [ns], or -1.  What is measured is in `real` and
     `whole` then.
 
-    `keys`: the Philox key of each link, (links, 2), the bits of its words as integers.  `trace`: states of the robots at the
+    `keys`: two Philox keys of each link, (links, 4), the bits of its words as integers.  `trace`: states of the robots at the
     instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted."""
     run = model.run[0]
     robots, nodes, blocks, streams, links = model.robots, model.nodes, model.blocks, model.streams, model.links
@@ -87,17 +86,17 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
         for number in range(len(robots)):
             if time_ns == whole[run.due_at + number]:
                 robot = robots[number]
-                _obey(run, robot, links[robot.link], real, whole, time_ns)
+                _obey(run, robot, links[robot.link], index, real, whole, time_ns)
                 whole[run.due_at + number] += robot.period_ns
     return lost_ns
 
 
 @compiled
-def _obey(run: Any, robot: Any, link: Any, real: Any, whole: Any, due_ns: int) -> None:
+def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, due_ns: int) -> None:
     """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
     now_ns, end_ns = due_ns, due_ns + robot.period_ns
     while now_ns < end_ns:
-        said, until_ns = hear(link, real, whole, now_ns), end_ns
+        said, until_ns = hear(link, index, real, whole, now_ns), end_ns
         if robot.on_arrival:
             change = change_ns(link, whole, now_ns)
             until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
@@ -127,7 +126,8 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
         marks = links[number].marks_at
         whole[marks + IN_USE] = whole[marks + NEWEST] = whole[marks + LAST] = -1
         whole[marks + NEXT] = FAR
-        whole[marks + KEY_0], whole[marks + KEY_1] = keys[number, 0], keys[number, 1]
+        for word in range(4):
+            whole[marks + KEY_0 + word] = keys[number, word]
     for number in range(len(blocks)):
         marks = blocks[number].marks_at
         whole[marks + M_FINITE] = 1

@@ -35,7 +35,7 @@ _MIDDLE: Final = 5 / 12
 def move(robot: Any, real: Any, now_ns: int, until_ns: int, ax: float, ay: float, commanded: bool) -> None:
     """Runs torque loop and plant from one instant to another with an acceleration."""
     h_ns = robot.torque_period_ns
-    if now_ns % h_ns == 0 and until_ns - now_ns == h_ns * robot.torque_periods:
+    if until_ns - now_ns == robot.period_ns:  # a whole period, which begins with a torque period
         _pass(robot, real, robot.torque_periods, ax, ay, commanded)
         return
     while now_ns < until_ns:

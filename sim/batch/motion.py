@@ -52,16 +52,21 @@ def move(robot: Any, real: Any, now_ns: int, until_ns: int, ax: float, ay: float
 @fused
 def _pass(robot: Any, real: Any, count: int, ax: float, ay: float, commanded: bool) -> None:
     """Runs torque loop and plant through whole torque periods."""
-    h = robot.h
+    at, h = robot.at, robot.h
+    right_square, left_square, peak = real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK]
     right = left = 0.0
     for _ in range(count):
         if commanded:
             right, left = inverse(robot, real, ax, ay, 0.5 * h)
         if robot.limited:
             right, left, acted = limits(robot, real, right, left)
-            real[robot.at + P_SATURATED] += acted
-            real[robot.at + HELD_S] = h
-        _turn_wheels(robot, real, right, left, h, 1.0)
+            real[at + P_SATURATED] += acted
+            real[at + HELD_S] = h
+        _step(robot, real, right, left, h)
+        right_square += right * right
+        left_square += left * left
+        peak = max(peak, abs(right), abs(left))
+    real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK] = right_square, left_square, peak
 
 
 @fused
@@ -82,20 +87,20 @@ def _pass_part(
             real[at + P_SATURATED] += 1.0
             real[at + P_PART] = 1.0
     real[at + HELD_S] = span
-    _turn_wheels(robot, real, right, left, span, span / robot.h)
+    _step(robot, real, right, left, span)
+    share = span / robot.h
+    real[at + P_RIGHT] += share * right * right
+    real[at + P_LEFT] += share * left * left
+    real[at + P_PEAK] = max(real[at + P_PEAK], abs(right), abs(left))
 
 
 @fused
-def _turn_wheels(robot: Any, real: Any, right: float, left: float, span: float, share: float) -> None:
-    """Moves a robot with torques through `span` [s], which is this share of a torque period."""
-    at = robot.at
+def _step(robot: Any, real: Any, right: float, left: float, span: float) -> None:
+    """Moves a robot with torques through `span` [s]."""
     if robot.plant == PAPER:
         paper_step(robot, real, right, left, span)
     else:
         body_step(robot, real, right, left, span)
-    real[at + P_RIGHT] += share * right * right
-    real[at + P_LEFT] += share * left * left
-    real[at + P_PEAK] = max(real[at + P_PEAK], abs(right), abs(left))
 
 
 @fused

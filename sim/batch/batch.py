@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from echelon.errors import UsageError
 from echelon.plan.plan import Plan
 from echelon.runtime.fates import ALL, link_key
-from echelon.sim.batch.model import ModelMaker, refusal
+from echelon.sim.batch.model import ModelMaker
 from echelon.sim.batch.outcomes import TRACED, BatchRuns, Kept, outcomes
+from echelon.sim.batch.refusals import refusal
 
 _WORD: Final = 2**64 - 1
 MOST_AT_ONCE: Final = 16

@@ -228,6 +228,6 @@ def test_no_seeds_are_refused() -> None:
 
 
 def test_a_link_of_which_it_does_not_know_everything_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("echelon.sim.batch.model._LINK", frozenset({"source", "receiver", "channel", "period_ns"}))
+    monkeypatch.setattr("echelon.sim.batch.refusals._LINK", frozenset({"source", "receiver", "channel", "period_ns"}))
     with pytest.raises(UsageError, match="does not know loss"):
         run_many(plan_of("lab", 'links=[{source="**", receiver="**", loss=0.1}]'), [1])

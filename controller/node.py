@@ -121,6 +121,7 @@ class TreeNode:
         links = {(link.source, link.channel): link for link in plan.links_into(node.index)}
         self._links = [links[child.source, child.channel] for child in children]
         self._positions = _positions_below(plan, node)
+        self._odd_clocks = any(not link.clocks_are_true for link in self._links)
         self._brings = plan.reference == "message"
         """True if states of children that are older than an act of this node are brought to the present"""
         self.stages = (
@@ -135,7 +136,9 @@ class TreeNode:
         if len(said) < len(heard):
             self._s = None
             return self._say_up(time_ns, NULL)
-        if self._brings and any(message is not None and message.time_ns != time_ns for message in heard):
+        if self._brings and (
+            self._odd_clocks or any(message is not None and message.time_ns != time_ns for message in heard)
+        ):
             said = self._brought(time_ns, heard)
         self._s = s = np.concatenate([values[CENTROID] for values in said])
         own = self._law.up @ s

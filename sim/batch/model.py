@@ -254,6 +254,8 @@ class ModelMaker:
             "gamma": law.gamma if sliding else 0.0,
             "beta": law.beta if sliding else 0.0,
             "kappa": law.kappa if sliding else 0.0,
+            "of_message": plan.reference == "message",
+            "ahead": plan.lead * plan.root.period_ns * 1e-9,
         }
 
     def _trajectory(self) -> tuple[int, list[Any]]:

@@ -5,7 +5,8 @@ from typing import Any
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.potential import add_pair_forces
-from echelon.sim.batch.streams import hear, heard_ns, room, say, take_up
+from echelon.sim.batch.records import STAMP
+from echelon.sim.batch.streams import hear, heard_ns, read_age_ns, room, say, take_up
 
 
 @fused
@@ -36,6 +37,8 @@ def gather(
             there, here, size = index[3 * part], index[3 * part + 1], index[3 * part + 2]
             for value in range(size):
                 real[node.state_at + here + value] = real[said + there + value]
+        if run.of_message:
+            _bring(node, run, links, table, index, real, whole, child, time_ns)
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -46,6 +49,33 @@ def gather(
             for value in range(up.size):
                 real[place + value] = real[node.state_at + value]
         say(up, whole, time_ns, 1 - complete)
+
+
+@fused
+def _bring(
+    node: Any, run: Any, links: Any, table: Any, index: Any, real: Any, whole: Any, child: int, time_ns: int
+) -> None:  # fmt: skip
+    """Moves a child's state on as the reference has moved since the time of its message (controller.node)."""
+    link = links[index[node.links_at + child]]
+    age_ns = read_age_ns(link, time_ns, whole[link.marks_at + STAMP])
+    if age_ns == 0:
+        return
+    x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
+    then_x, then_y, then_vx, then_vy, _, _ = desired(run, table, max(0, time_ns - age_ns) * 1e-9)
+    x, y = x - then_x, y - then_y
+    at = node.s_at + 4 * child
+    real[at] += x
+    real[at + 1] += y
+    real[at + 2] += vx - then_vx
+    real[at + 3] += vy - then_vy
+    if not run.avoidance:
+        return
+    for part in range(index[node.carried_at + child], index[node.carried_at + child + 1]):
+        here, size = index[3 * part + 1], index[3 * part + 2]
+        if here >= node.positions:
+            for value in range(0, size, 2):
+                real[node.state_at + here + value] += x
+                real[node.state_at + here + value + 1] += y
 
 
 @fused
@@ -72,7 +102,10 @@ def _transform(node: Any, run: Any, table: Any, real: Any, time_ns: int) -> None
             real[state + node.own_rates + 2 * variable] = real[e + 4 * variable + 2]
             real[state + node.own_rates + 2 * variable + 1] = real[e + 4 * variable + 3]
     if node.link < 0:
-        x, y, vx, vy, ax, ay = desired(run, table, time_ns * 1e-9)
+        t = time_ns * 1e-9
+        x, y, vx, vy, ax, ay = desired(run, table, t)
+        if run.ahead > 0.0:
+            _, _, _, _, ax, ay = desired(run, table, t + run.ahead)
         real[centroid] -= x
         real[centroid + 1] -= y
         real[centroid + 2] -= vx

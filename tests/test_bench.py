@@ -4,9 +4,10 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-from bench import lockstep
+from bench import batch, lockstep
 from bench.can import Robots, bus_rates, closed_in_process
 from bench.product import Row, table
 from echelon.bridge.can.bus import open_bus
@@ -61,3 +62,11 @@ def test_all_ways_over_a_bus_are_measured() -> None:
 
 def test_a_closed_path_is_measured() -> None:
     assert closed_in_process(0.05) > 0
+
+
+def test_loops_beside_the_batch_engine_do_the_same_work() -> None:
+    plan = batch.lab(0.5)
+    where = batch.batch(plan, 1)
+    for loop in (batch.plain_numpy, batch.plain_python):
+        assert np.abs(loop(plan, 1) - where).max() < 1e-9
+    assert batch.rate(batch.batch, plan, 2) > 0

@@ -26,6 +26,7 @@ class CentralLaw:
         self._weights = [make_weight(plan.law, block) for block in self._blocks]
         robots = len(plan.robots)
         self._forces = PairForces(*pairs_between([range(i, i + 1) for i in range(robots)]), robots, plan.avoidance)
+        self._ahead_s = plan.lead * plan.root.period_ns * 1e-9
         self.reset()
 
     def reset(self) -> None:
@@ -42,7 +43,7 @@ class CentralLaw:
         e_dot[-1] -= z_cd[1]
         e_dot = e_dot.ravel()
         feed_forward = np.zeros_like(e)
-        feed_forward[-2:] = z_cd[2]
+        feed_forward[-2:] = self.trajectory.at(t + self._ahead_s)[2] if self._ahead_s else z_cd[2]
         others = -self.plan.coupling @ e_dot
         if self.plan.avoidance.enabled and (forces := self._forces(positions)) is not None:
             sigma = np.repeat([block.sigma for block in self._blocks], [block.size for block in self._blocks])

@@ -56,7 +56,7 @@ from echelon.plan.plan import Array
 
 PRECISION: Final = 1e-12
 """Relative precision of η with look-ahead"""
-_STEPS: Final = 100
+STEPS: Final = 100
 """Largest number of steps of the search for η; it takes ten on average"""
 
 
@@ -120,7 +120,7 @@ def _led(f: Callable[[float, float], float], e: float, rate: float, h: float) ->
     if h == 0 or far == 0 or far != far:
         return far
     near, near_miss, far_miss = 0.0, -far, far - f(e + h * h / 2 * far, rate + h * far)
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         if far_miss * near_miss >= 0:  # only rounding can do this: `far` is the solution
             return far
         v = far - far_miss * (far - near) / (far_miss - near_miss)

@@ -83,7 +83,7 @@ def analyse(plan: Plan) -> Analysis:
         run.hyperperiod_ns * 1e-9,
         radius,
         {channel: largest_extra_delay(plan, channel) for channel in there} if radius < 1 else {},
-        _centroid_age(plan),
+        _centroid_age(plan) if plan.reference == "now" else 0.0,
     )
 
 

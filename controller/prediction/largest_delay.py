@@ -3,7 +3,7 @@
 All links of the channel get the same delay more, beyond what they have.  Where nodes and robots are time-driven it acts in
 ticks: a message is used at instants of its receiver, and said at instants of its source.  Where they are event-driven, whole
 ticks more shift what is used by as many messages; between the last stable tick and the next, bisection with the map finds the
-boundary, to `FINE`.
+boundary: by an iteration with the cut run, or else by bisection with the map.
 
 *If all periods are equal*, the linear run is cut open where the messages of the channel are sent (`LinearRun.loop`).  From the
 messages that receivers get, to the messages that are sent, its transfer matrix is
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, csc_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
-from echelon.controller.prediction.crossings import Eigenvalues, crossings, smallest_delay, unstable_roots
+from echelon.controller.prediction.crossings import Crossing, Eigenvalues, crossings, smallest_delay, unstable_roots
 from echelon.controller.prediction.gains import PredictionError, linear_gains
 from echelon.controller.prediction.linear_run import LinearRun, Loop, later, ruled_links
 from echelon.controller.prediction.spectrum import spectral_radius, strong_parts
@@ -38,8 +38,10 @@ from echelon.plan.plan import Array, Plan
 
 TRIED: Final = 50
 """Ticks up to which delays are tried out"""
-FINE: Final = 1e-4
-"""Of a tick: how closely the boundary is found where stages are event-driven"""
+FINE: Final = 1e-3
+"""How closely the boundary is found where stages are event-driven, as a share of the delay, or of a tick"""
+STEPS: Final = 6
+"""Largest number of steps of the iteration that finds it"""
 CONFIRMED: Final = 800
 """Size of the largest map that is computed to confirm a result"""
 SLOW: Final = 1e-3
@@ -79,15 +81,34 @@ def largest_extra_delay(plan: Plan, channel: Channel) -> LargestDelay:
     if found.ticks is None or found.ends == "limit" or not any(one.event_driven for one in plan.formation):
         return found
     tick_ns = round(found.tick_s * 1e9)
-    low_ns, high_ns = found.ticks * tick_ns, (found.ticks + 1) * tick_ns
-    first_ns = low_ns
-    while high_ns - low_ns > max(1, FINE * tick_ns):
-        middle_ns = (low_ns + high_ns) // 2
-        if _bears(plan, channel, middle_ns):
-            low_ns = middle_ns
-        else:
-            high_ns = middle_ns
-    return replace(found, beyond_s=(low_ns - first_ns) * 1e-9)
+    beyond_ns = _beyond(plan, channel, found.ticks, tick_ns) if found.ends == "unstable" else None
+    if beyond_ns is None:
+        low_ns, high_ns = found.ticks * tick_ns, (found.ticks + 1) * tick_ns
+        while high_ns - low_ns > max(1, FINE * high_ns):
+            middle_ns = (low_ns + high_ns) // 2
+            low_ns, high_ns = (middle_ns, high_ns) if _bears(plan, channel, middle_ns) else (low_ns, middle_ns)
+        beyond_ns = low_ns - found.ticks * tick_ns
+    return replace(found, beyond_s=beyond_ns * 1e-9)
+
+
+def _beyond(plan: Plan, channel: Channel, ticks: int, tick_ns: int) -> int | None:
+    """Returns how much more than `ticks` ticks is stable [ns] if all periods are equal; None if the criterion fails.
+
+    With f ticks more, 0 <= f < 1, the run bears k*(f) whole ticks, taken as continuous.  The boundary is where that is `ticks`.
+    k*(f) + f hardly depends on f, so f + k*(f) - ticks converges to it in a few steps."""
+    f = 0.0
+    for _ in range(STEPS):
+        run = LinearRun(later(plan, channel, round(f * tick_ns)))
+        found = None if run.periods() != {tick_ns} else _crossings(run, channel)
+        if not found or (edge := smallest_delay(found)) == inf:
+            return None
+        step = edge - ticks
+        f += step
+        if not 0 <= f < 1:
+            return None
+        if abs(step) < FINE:
+            return int(f * tick_ns)
+    return None
 
 
 def _bears(plan: Plan, channel: Channel, extra_ns: int) -> bool:
@@ -126,17 +147,8 @@ def _first_unstable(run: LinearRun, channel: Channel) -> int | None:
     """Returns the smallest number of extra ticks k for which a run is unstable that is stable for k = 0.
 
     Returns None if the criterion is not valid for the run, finds no such k, or is not confirmed by the maps."""
-    plan = run.plan
-    stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
-    slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
-    low = SLOW * slowest * run.hyperperiod_ns * 1e-9
-    found = []
-    for eigenvalues in _parts(run.loop(channel)):
-        if np.abs(eigenvalues(np.array([pi]))).max() >= 1:
-            return None
-        found += crossings(eigenvalues, low, pi)
-    edge = smallest_delay(found)
-    if edge == inf:
+    plan, found = run.plan, _crossings(run, channel)
+    if found is None or (edge := smallest_delay(found)) == inf:
         return None
     k = max(1, ceil(edge))
     while unstable_roots(found, k) <= 0:
@@ -146,6 +158,20 @@ def _first_unstable(run: LinearRun, channel: Channel) -> int | None:
         if late.size <= CONFIRMED and (spectral_radius(late.map()) < 1) != is_stable:
             return None
     return k
+
+
+def _crossings(run: LinearRun, channel: Channel) -> list[Crossing] | None:
+    """Returns where eigenvalues of R(e^{jω}) cross the unit circle; None if the criterion is not valid for the run."""
+    plan = run.plan
+    stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
+    slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
+    low = SLOW * slowest * run.hyperperiod_ns * 1e-9
+    found: list[Crossing] = []
+    for eigenvalues in _parts(run.loop(channel)):
+        if np.abs(eigenvalues(np.array([pi]))).max() >= 1:
+            return None
+        found += crossings(eigenvalues, low, pi)
+    return found
 
 
 def _patient(plan: Plan) -> Plan:

@@ -21,8 +21,10 @@ from echelon.role import Acts, Input, Stage
 from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.turns import Turn
 
-MOST: Final = 100_000
-"""Hyperperiods after which the search for the pattern ends"""
+LONGEST: Final = 5000
+"""Longest delay of a link [hyperperiods]: a message on its way is a number of the linear run for each of them"""
+MOST: Final = 1000
+"""Hyperperiods after which the search for the pattern ends, beside those that messages need"""
 NONE: Final = -(1 << 62)
 """Stands for no message"""
 _CONTENT: Final = np.zeros(1)
@@ -61,11 +63,15 @@ def schedule(plan: Plan, stages: Sequence[TimedStage]) -> Schedule:
     """Returns the acts of stages in one hyperperiod in the long run; `stages` are in the order of their levels.
 
     Raises PredictionError if a stage uses no message of an input, or if there is no pattern."""
-    run = _DryRun(plan, stages)
     longest_ns = max((link.delay_max_ns for link in plan.links), default=0)
+    if longest_ns > LONGEST * plan.root.period_ns:
+        raise PredictionError(
+            f"delays of up to {longest_ns / 1e9:g} s are too long to compute with: {LONGEST} periods at most"
+        )
+    run = _DryRun(plan, stages)
     same, needed = 0, 2 + -(-longest_ns // plan.root.period_ns)
     last: Schedule | None = None
-    for _ in range(max(MOST, 3 * needed)):
+    for _ in range(3 * needed + MOST):
         found = run.next_hyperperiod()
         same = same + 1 if found == last else 0
         last = found

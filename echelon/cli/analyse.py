@@ -104,6 +104,8 @@ def _later(found: "LargestDelay") -> str:
     """Returns in words how much later messages may be, and what happens beyond that.  Only for a formation that settles."""
     assert found.ticks is not None
     assert found.seconds is not None
+    if found.beyond_s > 0 and found.ends == "unstable":
+        return f"{1e3 * found.seconds:.6g} ms ({found.seconds / found.tick_s:.4g} ticks of {1e3 * found.tick_s:g} ms)"
     why = {
         "unstable": "one tick more does not settle",
         "timeout": "with one tick more they are older than the timeout allows, and not used at all",

@@ -190,9 +190,14 @@ class LinkPlan:
     def read_age_ns(self, time_ns: int, sent_ns: int) -> int:
         """Returns the age [ns] that a receiver reads at `time_ns` off a message sent at `sent_ns`: the true age if both clocks
         show the run time."""
-        if self.source_clock is self.receiver_clock is TRUE_CLOCK:
+        if self.clocks_are_true:
             return time_ns - sent_ns
         return self.receiver_clock.reading_ns(time_ns) - self.source_clock.reading_ns(sent_ns)
+
+    @property
+    def clocks_are_true(self) -> bool:
+        """True if the clocks of sender and receiver both show the run time."""
+        return self.source_clock.is_true and self.receiver_clock.is_true
 
     def expires_ns(self, sent_ns: int) -> int:
         """Returns the first instant at which a receiver finds a message too old that was sent at `sent_ns` [ns]."""
@@ -277,6 +282,8 @@ class Plan:
     """The coupling K̄ of all blocks, (2N, 2N) for N robots; a block is not coupled to itself"""
     lead: float
     """λ, how far ahead the law looks, in acceleration periods of the node (docs/architecture.md, 2.5)"""
+    reference: str
+    """`message` or `now`: of which time the reference is that a state is compared with (docs/architecture.md, 2.5)"""
     trajectory: Part[Any]
     """The desired trajectory of the centroid, a controller.trajectory.Trajectory"""
     avoidance: AvoidancePlan

@@ -79,6 +79,7 @@ def make_plan(scenario: Scenario, registry: Registry) -> Plan:
         law=scenario.law.parameters,
         coupling=coupling,
         lead=scenario.law.lead,
+        reference=scenario.law.reference,
         trajectory=scenario.trajectory,
         avoidance=AvoidancePlan(**scenario.avoidance.model_dump()),
         links=links,

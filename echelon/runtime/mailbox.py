@@ -183,7 +183,7 @@ class Mailbox:
         at_ns = max(time_ns, self._acted_ns)
         if of.acts is Acts.WHEN_HEARD:
             for slot in slots:
-                at_ns = max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns))
+                at_ns = min(max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns)), last_ns)
             at_ns = min(at_ns, last_ns)
         acts = [(at_ns, self.take(stage, at_ns))]
         if of.acts is Acts.ON_ARRIVAL:
@@ -240,7 +240,7 @@ class WallMailbox(Mailbox):
             return time_ns, False
         at_ns, last_ns = time_ns, self._last_ns(of, time_ns)
         for slot in slots:
-            at_ns = max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns))
+            at_ns = min(max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns)), last_ns)
         return min(at_ns, last_ns), at_ns >= last_ns and self.misses(stage, time_ns)
 
     def misses(self, stage: int, time_ns: int) -> bool:

@@ -205,6 +205,10 @@ class Law(Table):
     lead: Fraction = 0.0
     """λ, how far ahead the law looks, in acceleration periods, for laws that use it (docs/architecture.md, 2.5).  With 0 the
     law does not look ahead; 0.5 compensates for the hold of the accelerations"""
+    reference: Literal["message", "now"] = "message"
+    """The reference that a state is compared with (docs/architecture.md, 2.5).  `message`: that of the time of the state's
+    message.  `now`: that of the instant at which the node acts; then a delay τ leaves a steady lag, velocity × τ, in a moving
+    formation"""
 
     @field_serializer("use")
     def _use(self, use: str, info: SerializationInfo) -> WrittenLawName:

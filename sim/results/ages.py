@@ -1,7 +1,8 @@
 """How old the states are that nodes use, and the steady error that these ages cause in a moving formation.
 
-A node compares states of t - τ with the reference of t.  If the formation moves with the velocity v, the measured position is
-wrong by -v τ, and the law makes up for this: the formation stands v τ ahead of its reference.  This is a steady error, not an
+With `law.reference = "now"` a node compares states of t - τ with the reference of t.  If the formation moves with the velocity
+v, the measured position is wrong by -v τ, and the law makes up for this: the formation stands v τ ahead of its reference.
+This is a steady error, not an
 instability (docs/architecture.md, 2.10).  If a node's children have different ages, the shape is wrong, too: with the mean ages
 τ = (τ_1, τ_2, …) of the states of its children, its shape variable z is off by v (Φ_node τ)_z, and the centroid of the
 formation by v times the weighted mean of the root's τ.
@@ -24,8 +25,11 @@ DOWN: Final = (Channel.REFERENCE, Channel.COMMAND)
 
 def lag_times(plan: Plan, links: Sequence[LinkCounts]) -> Mapping[str, Array]:
     """Returns for each block the times [s], (size/2,), by which the velocity is multiplied to give the steady errors of its
-    variables.  A link without a used message counts with the age 0."""
+    variables.  A link without a used message counts with the age 0.  With the reference of the message's own time
+    (`law.reference`) there is no lag, and all times are 0."""
     age = {(link.source, link.receiver): link.age_mean_ns / 1e9 for link in links if link.channel in UP and link.used}
+    if plan.reference == "message":
+        age = {}
     below: dict[int, float] = {}
     """By node: the weighted mean age [s] of the robots' states in its group's state when the node computes it"""
     times: dict[int, Array] = {}

@@ -11,9 +11,8 @@ from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.linear_run import LinearRun, later
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.messages import Channel
-from echelon.plan.plan import Plan
 from support.growth import single
-from support.points import at_rest, growth_of_points, point_run
+from support.points import at_rest, growth_of_points, point_run, time_driven
 
 MS = 1_000_000
 
@@ -67,16 +66,6 @@ def test_one_block_of_gains_4_and_2_bears_a_state_0_3424_s_old():
     assert found.seconds == pytest.approx(0.3424, abs=1e-4)
     timed = largest_extra_delay(time_driven(plan), Channel.STATE)
     assert timed.seconds == pytest.approx(0.3, abs=1e-9)
-
-
-def time_driven(plan: Plan) -> Plan:
-    """Returns a plan whose nodes and robots are all time-driven."""
-    return replace(
-        plan,
-        robots=tuple(replace(robot, event_driven=False) for robot in plan.robots),
-        nodes=tuple(replace(node, event_driven=False) for node in plan.nodes),
-        links=tuple(replace(link, punctual=True) for link in plan.links),
-    )
 
 
 def test_points_begin_to_grow_where_the_boundary_is(monkeypatch):

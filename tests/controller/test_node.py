@@ -14,6 +14,7 @@ from echelon.messages import NULL, STATE_FIELDS, Channel, Message
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, LinkPlan, Plan
 from echelon.sim.engines.in_process import Engine
+from support.points import time_driven
 from support.trees import PAPER_TREE, plan_of, scenario, trees, with_random_gains
 from support.watched import LAWS, NEAR, Watched, random_plan
 
@@ -82,14 +83,14 @@ def test_torque_is_that_of_the_acceleration(tree, seed):
 
 def test_messages_are_null_until_every_child_has_sent():
     """The states of one robot take 2 ms.  Until then its leader, the nodes above, and all members below them send null
-    messages."""
+    messages.  Nodes are time-driven, so that messages are sent at multiples of the period."""
     tree = ((None, None), (None, None))
     plan = random_plan(tree, 1, "three", 0.5, avoidance=True, duration=0.004)
     late = tuple(
         replace(link, delay_min_ns=2_000_000, delay_max_ns=2_000_000) if link.source == 0 else link
         for link in plan.links
     )
-    run = Watched(replace(plan, links=late), 1)
+    run = Watched(time_driven(replace(plan, links=late)), 1)
     first, second, root = (node.index for node in plan.nodes)
     for time_ns in run.instants:
         silent = time_ns < 2_000_000
@@ -136,13 +137,13 @@ def test_the_references_of_a_slow_coordinator_are_held(ratio, coupling):
     run = Watched(plan, 7)
     cbt, gains = CentralLaw(plan).transformation, [BlockGains.of(plan, block) for block in plan.blocks]
     trajectory = CentralLaw(plan).trajectory
-    intra = slice(0, 12)
+    intra, ahead = slice(0, 12), plan.lead * plan.root.period_ns * 1e-9
 
     def error(time_ns: int) -> tuple[Array, Array, Array]:
         states, z_cd = run.states(time_ns), trajectory.at(time_ns * 1e-9)
         e, e_dot = cbt.forward(states[:, :2]) - cbt.desired(z_cd[0]), cbt.forward(states[:, 2:4])
         e_dot[-1] -= z_cd[1]
-        return e.ravel(), e_dot.ravel(), z_cd[2]
+        return e.ravel(), e_dot.ravel(), trajectory.at(time_ns * 1e-9 + ahead)[2]
 
     for time_ns in run.instants:
         due = time_ns % (ratio * 1_000_000) == 0

@@ -348,6 +348,14 @@ def test_a_message_that_is_overtaken_starts_no_act():
     assert [act for act in changes if act[1] is not None] == [one for one in expected.items() if one[0] < 60 * PERIOD]
 
 
+def test_an_input_that_comes_after_the_period_does_not_make_others_come_sooner():
+    links = [delayed(0, 8, punctual=False), delayed(1, 3, punctual=False)]
+    mailbox = mailbox_of(links, acts=Acts.WHEN_HEARD)
+    for link in links:  # both are sent at the end of the period, and arrive in the next one
+        mailbox.deliver(message_of(link, 0)._replace(time_ns=PERIOD - 1))
+    assert act_of(mailbox, 0) == (PERIOD - 1, [None, None])
+
+
 def test_messages_of_a_late_sender_arrive_their_delay_after_they_were_sent():
     link = replace(delayed(0, 3), punctual=False)
     mailbox = mailbox_of([link], acts=Acts.WHEN_HEARD)

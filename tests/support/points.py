@@ -56,6 +56,16 @@ class PointRobot:
         self.p, self.v = self.p + T * self.v + T**2 / 2 * self.a, self.v + T * self.a
 
 
+def time_driven(plan: Plan) -> Plan:
+    """Returns a plan whose nodes and robots are all time-driven."""
+    return replace(
+        plan,
+        robots=tuple(replace(robot, event_driven=False) for robot in plan.robots),
+        nodes=tuple(replace(node, event_driven=False) for node in plan.nodes),
+        links=tuple(replace(link, punctual=True) for link in plan.links),
+    )
+
+
 def at_rest(plan: Plan) -> Plan:
     """Returns a plan that wants all robots at the origin, at rest, without avoidance: its run is linear."""
     nodes = tuple(

@@ -73,11 +73,11 @@ def test_a_run_that_is_too_short_for_health_checks() -> None:
     ],
 )  # fmt: skip
 def test_links_that_do_something_else_than_they_seem_to(rule: str, says: str) -> None:
-    assert only(plan_of("lab", f"links=[{rule}]")).startswith(f"links: {says}")
+    assert only(plan_of("lab", "timing='time_driven'", f"links=[{rule}]")).startswith(f"links: {says}")
 
 
 def test_what_a_rounded_delay_is_said_to_act_as_is_what_the_run_does() -> None:
-    short = ("duration=1.0", "claims=[]")
+    short = ("duration=1.0", "claims=[]", "timing='time_driven'")
     rounded, whole = (
         trace_of(plan_of("lab", *short, f'links=[{{channel="state", delay={delay}}}]')) for delay in (0.004, 0.01)
     )
@@ -89,6 +89,11 @@ def test_on_the_closed_path_commands_are_used_at_torque_periods() -> None:
     plan = plan_of("drives", "periods.torque=0.005", 'links=[{channel="command", delay=0.005}]')
     assert not any(line.startswith("links") for line in warnings(plan))
     assert any("acts as 0.01 s" in line for line in warnings(replace_delay(plan, 6_000_000)))
+
+
+def test_event_driven_nodes_and_robots_take_delays_as_they_are() -> None:
+    rule = 'links=[{channel="state", delay=0.004}, {channel="command", delay={min=0.001, max=0.002}}]'
+    assert not any(line.startswith("links") for line in warnings(plan_of("lab", rule)))
 
 
 def replace_delay(plan: Plan, delay_ns: int) -> Plan:
@@ -149,11 +154,13 @@ def test_the_torque_loop_dies_away_up_to_its_edge(q: float, dies: bool) -> None:
     """Simulates torque loop and plant of a slightly turned robot that moves at v, with zero acceleration, for 60 periods."""
     plan = plan_of("lab", *FREE)
     robot = make_robot(plan, 0)
+    say, obey = robot.stages
     h, d = plan.robots[0].torque_period_ns * 1e-9, plan.robots[0].offset
     robot.state = state_at(0.0, 0.0, 0.0, q * d / h, 1e-9)
     for tick in range(60):
         time_ns = tick * plan.robots[0].period_ns
-        robot._move(time_ns, [Message(Channel.COMMAND, plan.robots[0].parent, tick, time_ns, np.zeros(6))])
+        obey.run(time_ns, [Message(Channel.COMMAND, plan.robots[0].parent, tick, time_ns, np.zeros(6))])
+        say.run(time_ns + plan.robots[0].period_ns, [])
     assert (abs(robot.state.omega) < 1e-9) == dies
     expected = 1e-9 * (1 - q + q**2 / 2) ** 60
     assert abs(robot.state.omega) == pytest.approx(expected, rel=0.05)

@@ -52,7 +52,7 @@ def moving(*overrides):
 @pytest.mark.parametrize("delay", [0.02, 0.05])
 def test_a_delay_of_all_links_leaves_the_centroid_ahead_by_what_it_moves_in_two_of_them(delay):
     """A robot's state is one delay old at its leader, and two delays old in the group's state at the coordinator."""
-    _, blocks, ended = moving(f"links=[{{delay={delay}}}]")
+    _, blocks, ended = moving("law.reference='now'", f"links=[{{delay={delay}}}]")
     assert blocks.series[-1].norm[-1] == pytest.approx(SPEED * 2 * delay, abs=0.4 * np.exp(-0.5 * 20))  # σ 1 s
     assert ended["centroid"].kind == "steady lag"
     assert f"velocity × delay is {SPEED * 2 * delay:.3g} m" in ended["centroid"].text
@@ -62,7 +62,7 @@ def test_a_delay_of_all_links_leaves_the_centroid_ahead_by_what_it_moves_in_two_
 def test_a_robot_that_is_heard_of_late_stands_ahead_by_its_own_delay_and_every_block_that_it_is_part_of_says_so():
     """The law makes the positions that it knows equal to the desired ones, m_i = p_i - v τ_i = d_i, so p_i = d_i + v τ_i."""
     late = 0.1
-    trace, blocks, ended = moving(f"links=[{{source='a/a1', channel='state', delay={late}}}]")
+    trace, blocks, ended = moving("law.reference='now'", f"links=[{{source='a/a1', channel='state', delay={late}}}]")
     ahead = np.zeros((len(trace.plan.robots), 2))
     ahead[0] = SPEED * late, 0.0
     shift = Transformation(trace.plan).forward(ahead).reshape(-1)
@@ -79,8 +79,15 @@ def test_a_robot_that_is_heard_of_late_stands_ahead_by_its_own_delay_and_every_b
             assert float(said[1]) == pytest.approx(np.linalg.norm(shift[at]), rel=5e-3)
 
 
+def test_without_delays_of_the_reference_there_is_no_lag():
+    """States are compared with the reference of their own time."""
+    _, blocks, ended = moving("links=[{delay=0.05}]")
+    assert blocks.series[-1].norm[-1] < 1e-3 * SPEED * 2 * 0.05
+    assert {one.kind for one in ended.values()} <= {"at rest", "falls"}
+
+
 def test_a_lag_is_no_growth_and_nothing_fails():
-    trace, links = run_of(parse(MOVING, "moving.toml", ["links=[{delay=0.05}]"])[1])
+    trace, links = run_of(parse(MOVING, "moving.toml", ["law.reference='now'", "links=[{delay=0.05}]"])[1])
     verdict = summarise(trace, links, None, run_facts()).verdict
     assert verdict.word == "HEALTHY", verdict.reasons
 

@@ -1,0 +1,89 @@
+"""Many runs of one plan at once: `run_many`."""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echelon.errors import UsageError
+from echelon.plan.plan import Plan
+from echelon.runtime.fates import ALL, link_key
+from echelon.sim.batch.model import ModelMaker
+from echelon.sim.batch.outcomes import TRACED, BatchRuns, Kept, outcomes
+from echelon.sim.batch.refusals import refusal
+
+_WORD: Final = 2**64 - 1
+MOST_AT_ONCE: Final = 16
+"""Largest number of runs that a thread takes at once"""
+
+
+def run_many(
+    plan: Plan,
+    seeds: Sequence[int],
+    *,
+    threads: int | None = None,
+    traces: bool = False,
+    say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
+    progress: Callable[[int], None] = lambda done: None,
+) -> BatchRuns:
+    """Runs a plan once for each seed, and returns what was measured.
+
+    Each run is the one that the in-process engine makes of the plan with that seed, to rounding.  It ends at the first instant
+    at which a robot's state is not finite.  Runs do not depend on `threads` (by default one for each core).  `traces` asks for
+    the robots' states too.  `say` gets a line when code must be compiled first, `progress` the number of runs done so far.
+
+    Raises UsageError if there are no seeds, or if this engine cannot run the plan."""
+    if not seeds or (threads is not None and threads < 1):
+        raise UsageError(f"{len(seeds)} seeds, {threads} threads: there must be at least one of each")
+    if why := refusal(plan):
+        raise UsageError(why)
+    maker = ModelMaker(plan)
+    model, pools = maker.make(), maker.pools
+    from echelon.sim.batch import whole_run  # the compiler, when it is needed
+
+    if not whole_run.is_kept():
+        say("compiling the batch engine: once on this machine, for about half a minute")
+    keys, kept = _keys(plan, seeds), Kept.of(model)
+    instants = plan.duration_ns // int(model.run["common_ns"][0]) + 1
+    traced = np.full((len(seeds) if traces else 1, instants if traces else 0, len(plan.robots), len(TRACED)), np.nan)
+    reals = np.empty((len(seeds), len(kept.reals)))
+    wholes = np.empty((len(seeds), len(kept.wholes)), dtype=np.int64)
+    lost_ns = np.empty(len(seeds), dtype=np.int64)
+
+    def work(part: range) -> int:
+        scratch = np.empty(pools.reals), np.empty(pools.wholes, dtype=np.int64)
+        whole_run.many_runs(
+            model, keys, part.start, part.stop, *scratch, traced, lost_ns, kept.reals, kept.wholes, reals, wholes
+        )
+        return len(part)
+
+    work(range(0))
+    count = threads or len(os.sched_getaffinity(0))
+    size = max(1, min(MOST_AT_ONCE, len(seeds) // (4 * count)))
+    parts = [range(first, min(first + size, len(seeds))) for first in range(0, len(seeds), size)]
+    pool, done = ThreadPoolExecutor(count), 0
+    try:
+        for finished in pool.map(work, parts):
+            done += finished
+            progress(done)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return outcomes(plan, model, seeds, lost_ns, reals, wholes, traced if traces else None)
+
+
+def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.int64]:
+    """Returns the bits of the Philox keys of each link for each seed, (seeds, links, 4): that of the link, and that of losses
+    for all receivers; zero for links that draw nothing."""
+    names = [one.name for one in plan.all_roles]
+    keys = np.zeros((len(seeds), max(1, len(plan.links)), 4), dtype=np.uint64)
+    drawing = [(at, link) for at, link in enumerate(plan.links) if not link.prompt]
+    for row, seed in enumerate(seeds):
+        for at, link in drawing:
+            key = link_key(seed, names[link.source], names[link.receiver], link.channel)
+            of_loss = link_key(seed, names[link.source], ALL, link.channel) if link.loss_of_message else 0
+            keys[row, at] = key & _WORD, key >> 64, of_loss & _WORD, of_loss >> 64
+    return keys.view(np.int64)

@@ -1,0 +1,70 @@
+"""The one place that knows the compiler.  Everything else in this room that is marked `compiled` is plain Python on numbers and
+arrays: it runs uncompiled too, only slowly (with NUMBA_DISABLE_JIT=1 in the environment).
+
+What is marked may call what is marked.  It allocates nothing: its scratch is an argument.  It uses floats and integers
+only.  So the same source can be compiled for other targets.
+
+Compiled code is kept in a folder for the sources it was made of, because numba looks only at the file of a function itself and
+not at the files of what that function calls.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import numba
+
+_compiler: Any = numba  # without types: what there is of them changes from version to version
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def compiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles a function when it is first called; its arithmetic is that of Python to the last bit."""
+    return _compiled(function, fused=False)
+
+
+def fused(function: Callable[P, R]) -> Callable[P, R]:
+    """The same, but a product may go into a sum without being rounded before."""
+    return _compiled(function, fused=True)
+
+
+def _compiled(function: Callable[P, R], fused: bool) -> Callable[P, R]:
+    _compiler.config.CACHE_DIR, before = str(cache_folder()), _compiler.config.CACHE_DIR
+    try:
+        # Nothing is allocated, so nothing needs counts of references (_nrt).
+        marked: Callable[P, R] = _compiler.njit(
+            cache=True, nogil=True, error_model="numpy", fastmath={"contract"} if fused else False, _nrt=False
+        )(function)
+        return marked
+    finally:
+        _compiler.config.CACHE_DIR = before
+
+
+def is_kept() -> bool:
+    """True if the compiled code of these sources is kept, so that loading it takes less than a second."""
+    return any(cache_folder().rglob("whole_run.many_runs*.nbc"))
+
+
+@cache
+def cache_folder() -> Path:
+    """Returns the folder of the compiled code: below `$NUMBA_CACHE_DIR`, `$XDG_CACHE_HOME/echelon` or `~/.cache/echelon`, or
+    below the folder for temporary files where that cannot be written."""
+    digest = hashlib.blake2b(numba.__version__.encode(), digest_size=8)
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    user = os.environ.get("NUMBA_CACHE_DIR")
+    base = Path(user) if user else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "echelon"
+    for place in (base, Path(tempfile.gettempdir()) / f"echelon-{os.getuid()}"):
+        folder = place / digest.hexdigest()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return folder

@@ -1,0 +1,149 @@
+"""What is measured of a run while it goes (sim.results, as arrays): errors of blocks, settling, distances.
+
+*Settling without the history.*  |e| has settled to the fraction f of the error S that it starts with from the instant after
+the last at which |e| > f S.  S is the largest |e| of the first response time, so f S is not known before that is over.  Let M
+be the largest |e| so far.  At an instant at which |e| exceeds M, it also exceeds f times the new M, because f < 1; and this
+instant is later than all before.  So it is enough to keep the last instant at which |e| > f M.
+"""
+
+from math import isfinite, sqrt
+from typing import Any
+
+from echelon.sim.batch.compiled import fused
+from echelon.sim.batch.law import desired, to_shape
+from echelon.sim.batch.potential import sort_along
+from echelon.sim.batch.records import (
+    BLOCK_WHOLES,
+    M_FINITE,
+    M_IAE,
+    M_ISE,
+    M_ITAE,
+    M_LAST,
+    M_OUT_FLOOR,
+    M_PEAK,
+    M_PEAK_NS,
+    M_START,
+    X,
+    Y,
+)
+
+
+@fused
+def measure(
+    run: Any,
+    robots: Any,
+    nodes: Any,
+    blocks: Any,
+    table: Any,
+    index: Any,
+    real: Any,
+    whole: Any,
+    time_ns: int,
+    step_ns: int,
+) -> None:
+    """Notes the robots' positions at `time_ns`, `step_ns` after the last time (0 at the first)."""
+    places = run.places_at
+    for robot in range(len(robots)):
+        real[places + 2 * robot] = real[robots[robot].at + X]
+        real[places + 2 * robot + 1] = real[robots[robot].at + Y]
+    for number in range(len(nodes)):
+        node = nodes[number]
+        count, z = node.count, node.f_pot_at
+        for child in range(count):
+            place = places + 2 * index[node.children_at + child]
+            real[node.a_at + 2 * child] = real[place]
+            real[node.a_at + 2 * child + 1] = real[place + 1]
+        to_shape(node, 2, table, real, node.a_at, z)
+        centroid = places + 2 * (len(robots) + number)
+        real[centroid] = real[z + 2 * (count - 1)]
+        real[centroid + 1] = real[z + 2 * (count - 1) + 1]
+        square = 0.0
+        for row in range(2 * (count - 1)):
+            square += (real[z + row] - table[node.desired_at + row]) ** 2
+        _note_error(run, blocks[node.block], table, real, whole, sqrt(square), time_ns, step_ns)
+        if node.link < 0:
+            x, y, _, _, _, _ = desired(run, table, time_ns / 1e9)
+            norm = sqrt((real[centroid] - x) ** 2 + (real[centroid + 1] - y) ** 2)
+            _note_error(run, blocks[-1], table, real, whole, norm, time_ns, step_ns)
+    if step_ns > 0:
+        _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+    for value in range(2 * len(robots)):
+        real[run.before_at + value] = real[places + value]
+    if step_ns == 0:
+        _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+
+
+@fused
+def _note_error(
+    run: Any, block: Any, table: Any, real: Any, whole: Any, norm: float, time_ns: int, step_ns: int
+) -> None:
+    at, marks = block.measures_at, block.marks_at
+    if step_ns == 0 or norm > real[at + M_PEAK] or (norm != norm and whole[marks + M_FINITE]):
+        real[at + M_PEAK] = norm
+        whole[marks + M_PEAK_NS] = time_ns
+    if not isfinite(norm):
+        whole[marks + M_FINITE] = 0
+    if time_ns <= block.response_ns and not norm <= real[at + M_START]:
+        real[at + M_START] = norm
+    for number in range(run.fractions):
+        if norm > table[run.fractions_at + number] * real[at + M_START]:
+            whole[marks + BLOCK_WHOLES + number] = time_ns
+    if norm > run.floor:
+        whole[marks + M_OUT_FLOOR] = time_ns
+    before = real[at + M_LAST]
+    step = step_ns / 1e9
+    real[at + M_ISE] += step * (norm * norm + before * before) / 2
+    real[at + M_IAE] += step * (norm + before) / 2
+    real[at + M_ITAE] += step * (norm * (time_ns / 1e9) + before * ((time_ns - step_ns) / 1e9)) / 2
+    real[at + M_LAST] = norm
+
+
+@fused
+def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
+    """Notes how close robots came since the last instant, on straight lines (sim.results.distances)."""
+    now, before = run.places_at, run.before_at
+    fastest = 0.0
+    for robot in range(robots):
+        dx, dy = (
+            real[now + 2 * robot] - real[before + 2 * robot],
+            real[now + 2 * robot + 1] - real[before + 2 * robot + 1],
+        )
+        fastest = max(fastest, dx * dx + dy * dy)
+    radius = run.avoidance_radius * run.avoidance_radius
+    reach = sqrt(max(real[run.distance_at], radius)) + 2 * sqrt(fastest)
+    order = run.order_at
+    axis = sort_along(robots, before, order, real, whole)
+    for place in range(robots - 1):
+        one = whole[order + place]
+        x, y = real[before + 2 * one], real[before + 2 * one + 1]
+        last = x + reach if axis == 0 else y + reach
+        for later in range(place + 1, robots):
+            other = whole[order + later]
+            if axis >= 0 and real[before + 2 * other + axis] > last:
+                break
+            x_apart, y_apart = real[before + 2 * other] - x, real[before + 2 * other + 1] - y
+            if x_apart * x_apart + y_apart * y_apart <= reach * reach:
+                _note_distance(run, one, other, real, whole, time_ns, step_ns)
+
+
+@fused
+def _note_distance(run: Any, one: int, other: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
+    """Notes how close two robots came since the last instant."""
+    now, before, radius = run.places_at, run.before_at, run.avoidance_radius * run.avoidance_radius
+    x = real[before + 2 * other] - real[before + 2 * one]
+    y = real[before + 2 * other + 1] - real[before + 2 * one + 1]
+    square = x * x + y * y
+    dx = real[now + 2 * other] - real[now + 2 * one] - x
+    dy = real[now + 2 * other + 1] - real[now + 2 * one + 1] - y
+    change = dx * dx + dy * dy
+    along = 0.0
+    if change > 0.0:
+        along = min(max(-(x * dx + y * dy) / change, 0.0), 1.0)
+    nearest = min((x + along * dx) ** 2 + (y + along * dy) ** 2, square)
+    if nearest < real[run.distance_at]:
+        real[run.distance_at] = nearest
+        whole[run.closest_at] = min(one, other)
+        whole[run.closest_at + 1] = max(one, other)
+        whole[run.closest_at + 2] = time_ns - step_ns + round(along * step_ns)
+    if nearest <= radius and (step_ns == 0 or square > radius):
+        whole[run.closest_at + 3] += 1

@@ -1,0 +1,270 @@
+"""From a plan to arrays (`records`): once for each plan, before its runs."""
+
+from collections.abc import Mapping
+from itertools import accumulate
+from math import gcd, lcm
+from typing import Any
+
+import numpy as np
+
+from echelon.controller.laws import Integral, Linear, TerminalSliding
+from echelon.controller.laws.law import Block, law_block
+from echelon.controller.trajectory import Circle, Line, Sine
+from echelon.controller.transformation import desired_shape
+from echelon.messages import Channel
+from echelon.plan.layout import NodeLayout, acceleration_of, length
+from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan
+from echelon.sim.batch import records as r
+from echelon.sim.batch.links import fates_of
+from echelon.sim.batch.outcomes import fractions
+from echelon.sim.batch.pools import Pools, records_of
+from echelon.sim.batch.robots import motion_of
+from echelon.sim.results.settling import response_ns
+
+
+class ModelMaker:
+    """Makes the arrays of a plan."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.pools = Pools()
+        self._links = {(link.source, link.receiver, link.channel): at for at, link in enumerate(plan.links)}
+        self._streams: dict[tuple[int, Channel], int] = {}
+        self.fractions = fractions(plan)
+
+    def make(self) -> r.Model:
+        """Returns the arrays."""
+        plan, pools = self.plan, self.pools
+        streams = [self._stream(source, channel) for source, channel in self._sources()]
+        links = [
+            self._link(at, streams[self._streams[link.source, link.channel]]) for at, link in enumerate(plan.links)
+        ]
+        robots = [self._robot(robot) for robot in plan.robots]
+        nodes = [self._node(node) for node in plan.nodes]
+        blocks = [self._block(block) for block in plan.blocks]
+        run = self._run()
+        table, index = pools.arrays()
+        return r.Model(
+            records_of(r.RUN, [run]),
+            records_of(r.ROBOT, robots),
+            records_of(r.NODE, nodes),
+            records_of(r.BLOCK, blocks),
+            records_of(r.STREAM, streams),
+            records_of(r.LINK, links),
+            table,
+            index,
+        )
+
+    def _sources(self) -> list[tuple[int, Channel]]:
+        """Returns the streams: every source and channel that a link begins with, in the order of the links."""
+        sources = list(dict.fromkeys((link.source, link.channel) for link in self.plan.links))
+        self._streams = {source: at for at, source in enumerate(sources)}
+        return sources
+
+    def _depth(self, source: int, channel: Channel) -> int:
+        """Returns how many messages of a stream are kept: a power of two, above those in flight at any time."""
+        most = 1
+        for link in self.plan.links:
+            if (link.source, link.channel) == (source, channel) and not link.prompt:
+                # A message may be sent a period late, and is asked for a period of the receiver later.
+                asked_ns = self.plan.formation[link.receiver].period_ns
+                most = max(most, (link.delay_max_ns + asked_ns) // link.period_ns + 4)
+        return 1 << (most - 1).bit_length()
+
+    def _stream(self, source: int, channel: Channel) -> dict[str, Any]:
+        depth = self._depth(source, channel)
+        if channel is Channel.STATE:
+            size = 4
+        else:
+            size = next(link.size or 0 for link in self.plan.links if (link.source, link.channel) == (source, channel))
+        return {
+            "size": size,
+            "mask": depth - 1,
+            "at": self.pools.real(depth * size),
+            "marks_at": self.pools.whole(1 + 2 * depth),
+        }
+
+    def _link(self, at: int, stream: Mapping[str, Any]) -> dict[str, Any]:
+        link, pools = self.plan.links[at], self.pools
+        parts = self._parts(at)
+        size = 0 if link.prompt else max(first + count for first, count in parts)
+        shift = (
+            parts[0][0] if len(parts) == 1 and size else 0
+        )  # of a long message that one part of is used, keep only that
+        record = {
+            "size": stream["size"],
+            "mask": stream["mask"],
+            "stream_at": stream["at"],
+            "stream_marks_at": stream["marks_at"],
+            "prompt": link.prompt,
+            "timeout_ns": link.timeout_ns,
+            "at": pools.real(size - shift) - shift,
+            "zeros_at": pools.real(stream["size"]) if link.policy == "zero" else -1,
+            "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
+        } | fates_of(link, pools)
+        for number, (first, count) in enumerate(parts, start=1):
+            record |= {f"first_{number}": first, f"size_{number}": count}
+        return record
+
+    def _parts(self, at: int) -> list[tuple[int, int]]:
+        """Returns what a receiver uses of the messages of a link: places and lengths."""
+        link, plan = self.plan.links[at], self.plan
+        receiver = plan.formation[link.receiver]
+        if link.channel is Channel.STATE:
+            return [(0, 4)]
+        if link.channel is Channel.GROUP_STATE:
+            return [(0, link.size or 0)]
+        slices = [acceleration_of(receiver)]
+        if link.channel is Channel.REFERENCE and isinstance(receiver, NodePlan):
+            mine = NodeLayout.of(plan, receiver).mine
+            assert mine is not None
+            slices += [part for part in (mine.rates, mine.forces) if length(part)]
+        return [(part.start, length(part)) for part in slices]
+
+    def _robot(self, robot: RobotPlan) -> dict[str, Any]:
+        return motion_of(robot) | {
+            "on_arrival": robot.event_driven and not all(link.prompt for link in self.plan.links_into(robot.index)),
+            "at": self.pools.real(r.ROBOT_REALS),
+            "stream": self._streams[robot.index, Channel.STATE],
+            "link": self._links[robot.parent, robot.index, Channel.COMMAND],
+            "command": 2 * robot.child_number,
+        }
+
+    def _node(self, node: NodePlan) -> dict[str, Any]:
+        plan, pools, layout = self.plan, self.pools, NodeLayout.of(self.plan, node)
+        count, state, mine = len(node.children), layout.state, layout.mine
+        kinds = [Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE for child in node.children]
+        links = [self._links[child, node.index, kind] for child, kind in zip(node.children, kinds, strict=True)]
+        parent = None if node.parent is None else plan.formation[node.parent]
+        coupled = length(state.rates) > 0
+        return {
+            "period_ns": node.period_ns,
+            "parent_period_ns": 1 if parent is None else parent.period_ns,
+            "when_heard": node.event_driven and not all(link.prompt for link in plan.links_into(node.index)),
+            "count": count,
+            "robots": node.robots,
+            "links_at": pools.index(links),
+            "children_at": pools.index(node.children),
+            "shares_at": pools.table(
+                [w / total for w, total in zip(node.weights, accumulate(node.weights), strict=True)]
+            ),
+            "means_at": pools.table([1 / weight for weight in node.weights]),
+            "bounds_at": pools.index(list(accumulate(node.weights, initial=0))),
+            "child_of_at": pools.index([child for child, weight in enumerate(node.weights) for _ in range(weight)]),
+            "carried_at": self._carried(layout, count),
+            "up": self._streams.get((node.index, Channel.GROUP_STATE), -1),
+            "reference": self._streams.get((node.index, Channel.REFERENCE), -1),
+            "command": self._streams.get((node.index, Channel.COMMAND), -1),
+            "link": -1 if node.parent is None else self._links[node.parent, node.index, Channel.REFERENCE],
+            "acceleration": 0 if mine is None else mine.acceleration.start,
+            "parent_rates": 0 if mine is None else mine.rates.start,
+            "parent_forces": 0 if mine is None else mine.forces.start,
+            "block": next(at for at, block in enumerate(plan.blocks) if block.node == node.index),
+            "desired_at": pools.table(desired_shape(node.shape, node.weights)),
+            "s_at": pools.real(4 * count),
+            "e_at": pools.real(4 * count),
+            "c_at": pools.real(2),
+            "eta_at": pools.real(2 * count),
+            "a_at": pools.real(2 * count),
+            "f_pot_at": pools.real(2 * count),
+            "forces_at": pools.real(2 * node.robots if plan.avoidance.enabled else 0),
+            "order_at": pools.whole(node.robots + 1 if plan.avoidance.enabled else 0),
+            "state_at": pools.real(state.size),
+            "has_state_at": pools.whole(1),
+            "acted_at": pools.whole(1),
+            "own_rates": state.own_rates.start if coupled else -1,
+            "centroid_rates": state.centroid_rates.start,
+            "rates": state.rates.start,
+            "rates_size": 2 * len(plan.robots) if plan.coupled else 0,
+            "positions": state.positions.start,
+        }
+
+    def _carried(self, layout: NodeLayout, count: int) -> int:
+        """Returns the place of what a node copies of each child's message: bounds, then (there, here, length)."""
+        entries = [(part.child, part.there.start, part.here.start, length(part.there)) for part in layout.carried]
+        self.pools.index([0] * (-self.pools.index([]) % 3))  # places of threes are counted in threes
+        place = self.pools.index([number for entry in entries for number in entry[1:]]) // 3
+        bounds = [place + sum(entry[0] < child for entry in entries) for child in range(count + 1)]
+        return self.pools.index(bounds)
+
+    def _block(self, block: BlockPlan) -> dict[str, Any]:
+        pools, seen = self.pools, law_block(self.plan, block)
+        K_1, K_2, K_i, weight, bound = self._gains(seen)
+        matrices = K_1, K_2, K_i, weight / block.sigma
+        diagonal = all(np.array_equal(matrix, np.diag(np.diag(matrix))) for matrix in matrices)
+        places = [pools.table(np.diag(matrix) if diagonal else matrix) for matrix in matrices]
+        coupling = weight @ self.plan.coupling[block.offset : block.offset + block.size]
+        rows = [np.flatnonzero(row).tolist() for row in coupling]
+        bounds = list(accumulate(map(len, rows), initial=0))
+        return {
+            "size": block.size,
+            "diagonal": diagonal,
+            "k1_at": places[0],
+            "k2_at": places[1],
+            "ki_at": places[2],
+            "pot_at": places[3],
+            "rows_at": pools.index([*bounds, *(column for row in rows for column in row)]),
+            "values_at": pools.table(coupling[coupling != 0]),
+            "integral_at": pools.real(block.size if isinstance(self.plan.law.made, Integral) else 0),
+            "measures_at": pools.real(r.BLOCK_REALS),
+            "marks_at": pools.whole(r.BLOCK_WHOLES + len(self.fractions)),
+            "sigma": block.sigma,
+            "ahead": seen.ahead_s,
+            "period": seen.period_s,
+            "bound": bound,
+            "response_ns": response_ns(block),
+        }
+
+    def _gains(self, block: Block) -> tuple[Array, Array, Array, Array, float]:
+        """Returns K_1, K_2, K_i and W of a block, with look-ahead, and the bound of its integral."""
+        law = self.plan.law.made
+        if isinstance(law, Linear | Integral):
+            gains = law.linear(block)
+            bound = law.limit * block.sigma**3 / law.k_i if isinstance(law, Integral) else 0.0
+            return gains.K_1, gains.K_2, gains.K_i, gains.weight, bound
+        none = np.zeros((block.size, block.size))
+        return none, none, none, law.weight(block), 0.0
+
+    def _run(self) -> dict[str, Any]:
+        plan, pools, avoidance = self.plan, self.pools, self.plan.avoidance
+        kind, numbers = self._trajectory()
+        law = plan.law.made
+        sliding = isinstance(law, TerminalSliding)
+        return {
+            "duration_ns": plan.duration_ns,
+            "tick_ns": gcd(*[one.period_ns for one in plan.formation]),
+            "common_ns": lcm(*[robot.period_ns for robot in plan.robots]),
+            "avoidance": avoidance.enabled,
+            "law": r.SLIDING if sliding else r.INTEGRAL if isinstance(law, Integral) else r.LINEAR,
+            "trajectory": kind,
+            "trajectory_at": pools.table(numbers),
+            "trajectory_legs": len(numbers) - 1,
+            "fractions_at": pools.table(self.fractions),
+            "fractions": len(self.fractions),
+            "due_at": pools.whole(len(plan.formation)),
+            "places_at": pools.real(2 * len(plan.formation)),
+            "before_at": pools.real(2 * len(plan.robots)),
+            "order_at": pools.whole(len(plan.robots) + 1),
+            "distance_at": pools.real(1),
+            "closest_at": pools.whole(4),
+            "avoidance_radius": avoidance.avoidance_radius,
+            "sensing_radius": avoidance.sensing_radius,
+            "force_limit": avoidance.force_limit,
+            "floor": plan.health.floor,
+            "gamma": law.gamma if sliding else 0.0,
+            "beta": law.beta if sliding else 0.0,
+            "kappa": law.kappa if sliding else 0.0,
+            "of_message": plan.reference == "message",
+            "ahead": plan.lead * plan.root.period_ns * 1e-9,
+        }
+
+    def _trajectory(self) -> tuple[int, list[Any]]:
+        """Returns the kind of the trajectory and its numbers, for waypoints rows of (time, x, y)."""
+        made = self.plan.trajectory.made
+        if isinstance(made, Line):
+            return r.LINE, [*made.start, *made.velocity]
+        if isinstance(made, Circle):
+            return r.CIRCLE, [*made.centre, made.radius, made.rate, made.phase]
+        if isinstance(made, Sine):
+            return r.SINE, [*made.start, made.speed, made.amplitude, made.rate]
+        return r.WAYPOINTS, [(t, *point) for t, point in zip(made.times, made.points, strict=True)]

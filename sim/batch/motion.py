@@ -1,0 +1,251 @@
+"""How a robot moves: inverse, torque limits and plants (agents.torque and agents.plant, as arrays)."""
+
+from math import ceil, isfinite, sqrt
+from typing import Any, Final
+
+from echelon.sim.batch.angles import cos_sin
+from echelon.sim.batch.compiled import fused
+from echelon.sim.batch.records import (
+    COS,
+    HELD_S,
+    OMEGA,
+    P_LEFT,
+    P_PART,
+    P_PEAK,
+    P_RIGHT,
+    P_SATURATED,
+    PAPER,
+    SIN,
+    TAU_LEFT,
+    TAU_RIGHT,
+    THETA,
+    V,
+    X,
+    Y,
+)
+
+_INNER: Final = (1 - sqrt(1 / 5)) / 2
+"""Inner points of the Gauss-Lobatto rule with four points on [0, 1]: this, and 1 less this"""
+_ENDS: Final = 1 / 12
+_MIDDLE: Final = 5 / 12
+"""Its weights"""
+
+
+@fused
+def move(robot: Any, real: Any, now_ns: int, until_ns: int, ax: float, ay: float, commanded: bool) -> None:
+    """Runs torque loop and plant from one instant to another with an acceleration."""
+    h_ns = robot.torque_period_ns
+    if until_ns - now_ns == robot.period_ns:  # a whole period, which begins with a torque period
+        _pass(robot, real, robot.torque_periods, ax, ay, commanded)
+        return
+    while now_ns < until_ns:
+        left_ns, count = h_ns - now_ns % h_ns, (until_ns - now_ns) // h_ns
+        if left_ns == h_ns and count > 0:
+            _pass(robot, real, count, ax, ay, commanded)
+            now_ns += count * h_ns
+        else:  # an acceleration arrives within this torque period, or has arrived
+            span_ns = min(left_ns, until_ns - now_ns)
+            _pass_part(robot, real, span_ns * 1e-9, left_ns * 1e-9, left_ns == h_ns, ax, ay, commanded)
+            now_ns += span_ns
+
+
+@fused
+def _pass(robot: Any, real: Any, count: int, ax: float, ay: float, commanded: bool) -> None:
+    """Runs torque loop and plant through whole torque periods."""
+    at, h = robot.at, robot.h
+    right_square, left_square, peak = real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK]
+    right = left = 0.0
+    for _ in range(count):
+        if commanded:
+            right, left = inverse(robot, real, ax, ay, 0.5 * h)
+        if robot.limited:
+            right, left, acted = limits(robot, real, right, left)
+            real[at + P_SATURATED] += acted
+            real[at + HELD_S] = h
+        _step(robot, real, right, left, h)
+        right_square += right * right
+        left_square += left * left
+        peak = max(peak, abs(right), abs(left))
+    real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK] = right_square, left_square, peak
+
+
+@fused
+def _pass_part(
+    robot: Any, real: Any, span: float, left_s: float, first: bool, ax: float, ay: float, commanded: bool
+) -> None:
+    """Runs torque loop and plant through `span` [s] of a torque period of which `left_s` [s] are left; `first`: it begins
+    now."""
+    at = robot.at
+    right = left = 0.0
+    if commanded:
+        right, left = inverse(robot, real, ax, ay, 0.5 * left_s)
+    if first:
+        real[at + P_PART] = 0.0
+    if robot.limited:
+        right, left, acted = limits(robot, real, right, left)
+        if acted > real[at + P_PART]:
+            real[at + P_SATURATED] += 1.0
+            real[at + P_PART] = 1.0
+    real[at + HELD_S] = span
+    _step(robot, real, right, left, span)
+    share = span / robot.h
+    real[at + P_RIGHT] += share * right * right
+    real[at + P_LEFT] += share * left * left
+    real[at + P_PEAK] = max(real[at + P_PEAK], abs(right), abs(left))
+
+
+@fused
+def _step(robot: Any, real: Any, right: float, left: float, span: float) -> None:
+    """Moves a robot with torques through `span` [s]."""
+    if robot.plant == PAPER:
+        paper_step(robot, real, right, left, span)
+    else:
+        body_step(robot, real, right, left, span)
+
+
+@fused
+def limits(robot: Any, real: Any, right: float, left: float) -> tuple[float, float, float]:
+    """Returns the limited torques, and 1 if one was limited, else 0; keeps them for the next call."""
+    at = robot.at
+    v, turning = real[at + V], robot.arm * real[at + OMEGA]
+    last_right, last_left = real[at + TAU_RIGHT], real[at + TAU_LEFT]
+    most, change = robot.torque_limit, robot.torque_rate_limit * real[at + HELD_S]
+    acted = 0.0
+    if not (
+        abs(right) <= most
+        and abs(left) <= most
+        and abs(right - last_right) <= change
+        and abs(left - last_left) <= change
+        and abs(v) + abs(turning) <= robot.speed_limit
+    ):
+        wanted_right, wanted_left = right, left
+        right = _limited(robot, right, last_right, change, v + turning)
+        left = _limited(robot, left, last_left, change, v - turning)
+        if right != wanted_right or left != wanted_left:
+            acted = 1.0
+    real[at + TAU_RIGHT] = right
+    real[at + TAU_LEFT] = left
+    return right, left, acted
+
+
+@fused
+def inverse(robot: Any, real: Any, ax: float, ay: float, lead: float) -> tuple[float, float]:
+    """Returns the wheel torques for a wanted acceleration, for the state after `lead` [s]."""
+    at = robot.at
+    theta, v, omega, c, s = real[at + THETA], real[at + V], real[at + OMEGA], real[at + COS], real[at + SIN]
+    d = robot.offset
+    v_dot = c * ax + s * ay + d * omega * omega
+    omega_dot = (c * ay - s * ax - v * omega) * robot.per_offset
+    theta += lead * (omega + 0.5 * lead * omega_dot)
+    v += lead * v_dot
+    omega += lead * omega_dot
+    c, s = cos_sin(theta)
+    total = robot.half_sum * (c * ax + s * ay + d * omega * omega)
+    difference = robot.half_difference * (c * ay - s * ax - v * omega)
+    return total + difference, total - difference
+
+
+@fused
+def _limited(robot: Any, wanted: float, last: float, change: float, speed: float) -> float:
+    """Returns the limited torque of one wheel, whose torque was `last` and changes by `change` at most.  It runs over the
+    ground with `speed` [m/s]."""
+    if wanted != wanted:
+        return 0.0
+    tau = min(max(wanted, last - change), last + change)
+    tau = min(max(tau, -robot.torque_limit), robot.torque_limit)
+    if abs(speed) > robot.speed_limit and tau * speed > 0.0:
+        return 0.0
+    return float(tau)
+
+
+@fused
+def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float) -> None:
+    """Moves a robot of the paper's plant through h [s]."""
+    at, d = robot.at, robot.offset
+    theta, v, omega, c_0, s_0 = real[at + THETA], real[at + V], real[at + OMEGA], real[at + COS], real[at + SIN]
+    v_dot = (tau_right + tau_left) * robot.per_sum
+    omega_dot = (tau_right - tau_left) * robot.per_difference
+    half = 0.5 * omega_dot
+    theta_1, v_1 = theta + h * (omega + half * h), v + v_dot * h
+    c_1, s_1 = cos_sin(theta_1)
+    x, y = real[at + X] + d * (c_1 - c_0), real[at + Y] + d * (s_1 - s_0)
+    turn = h * (abs(omega) + abs(omega_dot) * h)
+    if turn <= 0.5:
+        t_1, t_2 = _INNER * h, (1 - _INNER) * h
+        c_i, s_i = cos_sin(theta + t_1 * (omega + half * t_1))
+        c_j, s_j = cos_sin(theta + t_2 * (omega + half * t_2))
+        v_i, v_j = v + v_dot * t_1, v + v_dot * t_2
+        ends, inner = h * _ENDS, h * _MIDDLE
+        x += ends * (v * c_0 + v_1 * c_1) + inner * (v_i * c_i + v_j * c_j)
+        y += ends * (v * s_0 + v_1 * s_1) + inner * (v_i * s_i + v_j * s_j)
+    else:
+        panels = 1
+        if isfinite(turn):
+            panels = 16 if turn >= 8.0 else ceil(2 * turn)
+        width = h / panels
+        ends, inner = width * _ENDS, width * _MIDDLE
+        for panel in range(panels):
+            for node in range(4):
+                weight = ends if node in (0, 3) else inner
+                part = 0.0 if node == 0 else (_INNER if node == 1 else (1 - _INNER if node == 2 else 1.0))
+                t = (panel + part) * width
+                along = weight * (v + v_dot * t)
+                c, s = cos_sin(theta + t * (omega + half * t))
+                x += along * c
+                y += along * s
+    real[at + X] = x
+    real[at + Y] = y
+    real[at + THETA] = theta_1
+    real[at + V] = v_1
+    real[at + OMEGA] = omega + omega_dot * h
+    real[at + COS] = c_1
+    real[at + SIN] = s_1
+
+
+@fused
+def body_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float) -> None:
+    """Moves a rigid body, on a hill or not, through h [s]."""
+    at = robot.at
+    push = (tau_right + tau_left) * robot.per_sum
+    turn = (tau_right - tau_left) * robot.per_difference
+    x, y, theta, v, omega = real[at + X], real[at + Y], real[at + THETA], real[at + V], real[at + OMEGA]
+    pace = h * (abs(omega) + robot.lever * abs(v) + sqrt(abs(turn)) + sqrt(robot.lever * abs(push)) + robot.always)
+    count = 1
+    if isfinite(pace):
+        count = 500 if pace >= 10.0 else max(1, ceil(pace / 0.02))
+    k = h / count
+    for _ in range(count):
+        a_x, a_y, a_v, a_w = _rates(robot, theta, v, omega, push, turn)
+        o_b = omega + 0.5 * k * a_w
+        b_x, b_y, b_v, b_w = _rates(robot, theta + 0.5 * k * omega, v + 0.5 * k * a_v, o_b, push, turn)
+        o_c = omega + 0.5 * k * b_w
+        c_x, c_y, c_v, c_w = _rates(robot, theta + 0.5 * k * o_b, v + 0.5 * k * b_v, o_c, push, turn)
+        o_e = omega + k * c_w
+        e_x, e_y, e_v, e_w = _rates(robot, theta + k * o_c, v + k * c_v, o_e, push, turn)
+        sixth = k / 6
+        x += sixth * (a_x + 2 * (b_x + c_x) + e_x)
+        y += sixth * (a_y + 2 * (b_y + c_y) + e_y)
+        theta += sixth * (omega + 2 * (o_b + o_c) + o_e)
+        v += sixth * (a_v + 2 * (b_v + c_v) + e_v)
+        omega += sixth * (a_w + 2 * (b_w + c_w) + e_w)
+    real[at + X] = x
+    real[at + Y] = y
+    real[at + THETA] = theta
+    real[at + V] = v
+    real[at + OMEGA] = omega
+    real[at + COS], real[at + SIN] = cos_sin(theta)
+
+
+@fused
+def _rates(
+    robot: Any, theta: float, v: float, omega: float, push: float, turn: float
+) -> tuple[float, float, float, float]:
+    """Returns the rates of x, y, v and ω; that of θ is ω."""
+    c, s = cos_sin(theta)
+    d = robot.offset
+    return (
+        v * c - d * omega * s,
+        v * s + d * omega * c,
+        push + d * omega * omega + (robot.pull_x * c + robot.pull_y * s) - robot.drag * v,
+        turn - robot.lever * (v * omega - (robot.pull_y * c - robot.pull_x * s)) - robot.turn_drag * omega,
+    )

@@ -1,0 +1,128 @@
+"""What a plan is as arrays: one record for the run, and one for each robot, node, block, stream and link.
+
+Matrices and lists of any length are in two pools: `table` of floats and `indices` of integers.  A field that ends in `_at` says
+where in a pool, or where in the scratch of a run, its part begins.  -1 means that there is none.
+
+The scratch of a run is two arrays: `real` of floats and `whole` of integers.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_FLOAT: Final = "f8"
+_INT: Final = "i8"
+
+
+def _record(wholes: str, reals: str) -> np.dtype[np.void]:
+    return np.dtype([(name, _INT) for name in wholes.split()] + [(name, _FLOAT) for name in reals.split()])
+
+
+RUN: Final = _record(
+    # instants [ns]; whether robots avoid each other; law and trajectory (below), the trajectory's numbers in `table`
+    "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
+    # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and those of robots before, and their
+    # order (potential); square of the smallest distance; the pair and its instant, then the number of violations
+    "due_at places_at before_at order_at distance_at closest_at "
+    # whether late states are compared with the reference of their own time
+    "of_message",
+    # `ahead`: how far the feed-forward is led [s]
+    "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead",
+)
+ROBOT: Final = _record(
+    # `at`: its state in `real`; `command`: place of its acceleration in its leader's COMMAND
+    "period_ns torque_period_ns torque_periods plant limited on_arrival at stream link command",
+    # plant and inverse (agents.plant, agents.torque); lever to always: of the rigid body
+    "h per_sum per_difference offset half_sum half_difference lever pull_x pull_y drag turn_drag always "
+    "per_offset torque_limit torque_rate_limit speed_limit arm x y heading",
+)
+NODE: Final = _record(
+    # whether it waits for its inputs; number of children and of robots below; in `table` w_k/(w_1 + … + w_k) and 1/w_k of each
+    # child k; in `indices` links from the children, their indices, the bounds of their robots, each robot's child, and what of
+    # their messages is carried up
+    "period_ns parent_period_ns when_heard count robots shares_at means_at links_at children_at bounds_at child_of_at "
+    "carried_at "
+    # streams that it sends, the link from its parent, and places in its parent's REFERENCE
+    "up reference command link acceleration parent_rates parent_forces "
+    # its block, and its desired shape in `table`; scratch: s, e, acceleration of its centroid, η, accelerations, F_pot, forces,
+    # and its robots in order (potential)
+    "block desired_at s_at e_at c_at eta_at a_at f_pot_at forces_at order_at "
+    # its GROUP_STATE, whether it has one, when it acted last, and places in its GROUP_STATE
+    "state_at has_state_at acted_at own_rates centroid_rates rates rates_size positions",
+    "",
+)
+BLOCK: Final = _record(
+    # gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in `indices`, values in `table`
+    "size diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
+    "sigma ahead period bound",
+)
+STREAM: Final = _record(
+    # a role's messages on one channel: the last mask + 1 of them, of `size` values each from `at` in `real`; in `whole` their
+    # number so far, then of each its stamp and whether it is null
+    "size mask at marks_at",
+    "",
+)
+LINK: Final = _record(
+    # its stream, as above; `at`: the message in use in `real`, `zeros_at`: what is used where it is too old (policy `zero`);
+    # places and sizes of the parts that the receiver uses of a message
+    "size mask stream_at stream_marks_at prompt timeout_ns at zeros_at marks_at first_1 size_1 first_2 size_2 first_3 size_3 "
+    # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
+    "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
+    "bursts loss_of_message fifo source_offset_ns receiver_offset_ns",
+    "loss duplicates to_bad to_good share_bad loss_good loss_bad source_drift receiver_drift",
+)
+
+PAPER, BODY = 0, 1
+"""`ROBOT.plant`"""
+LINEAR, INTEGRAL, SLIDING = 0, 1, 2
+"""`RUN.law`"""
+LINE, CIRCLE, SINE, WAYPOINTS = 0, 1, 2, 3
+"""`RUN.trajectory`"""
+
+# Places in a robot's part of `real`.
+X, Y, THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT, HELD_S = range(10)
+"""... torques last held, and how long they were held [s]"""
+P_RIGHT, P_LEFT, P_PEAK, P_SATURATED, P_PART = range(10, 15)
+"""Of the period so far, in torque periods: sums of the torques' squares, largest torque, torque periods in which a limit acted;
+whether one acted in an earlier part of the present torque period"""
+S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(15, 21)
+"""The same of all periods so far, squares as means; those after the first second; number of periods"""
+ROBOT_REALS: Final = 21
+
+DRAWN, TABLE, TABLE_Z, BY_NUMBER, BY_TIME = range(5)
+"""`LINK.kind`: uniform, a table of independent or of correlated delays, a trace"""
+
+# Places in a link's part of `whole`.
+TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX = range(12)
+NEXT, NEWEST, OLDEST, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 22)
+F_OWN, F_LOSS, F_COPY, F_BURST = 22, 26, 30, 34
+"""Draws of two messages"""
+LINK_WHOLES: Final = 38
+"""After these come the arrivals of the messages in flight [ns], then those of their second copies"""
+COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX)
+"""What of these is a result"""
+GONE: Final = -1
+"""Arrival of a message that was delivered or lost"""
+FAR: Final = 1 << 62
+"""An instant that never comes [ns]"""
+
+# Places in a block's part of `real` and of `whole`.
+M_LAST, M_PEAK, M_START, M_ISE, M_IAE, M_ITAE = range(6)
+BLOCK_REALS: Final = 6
+M_PEAK_NS, M_FINITE, M_OUT_FLOOR = range(3)
+BLOCK_WHOLES: Final = 3
+"""After these comes for each fraction the last instant at which |e| was outside of it [ns]"""
+
+
+class Model(NamedTuple):
+    """A plan as arrays."""
+
+    run: NDArray[np.void]
+    robots: NDArray[np.void]
+    nodes: NDArray[np.void]
+    blocks: NDArray[np.void]
+    streams: NDArray[np.void]
+    links: NDArray[np.void]
+    table: NDArray[np.float64]
+    indices: NDArray[np.int64]

@@ -1,0 +1,183 @@
+"""One whole run, and many of them: what a thread of the batch engine does."""
+
+from math import cos, isfinite, sin
+from typing import Any, Final
+
+from echelon.sim.batch.compiled import compiled, is_kept
+from echelon.sim.batch.measures import measure
+from echelon.sim.batch.motion import move
+from echelon.sim.batch.node import gather, steer
+from echelon.sim.batch.records import (
+    COS,
+    FAR,
+    HELD_S,
+    IN_USE,
+    KEY_0,
+    LAST,
+    M_FINITE,
+    NEWEST,
+    NEXT,
+    OMEGA,
+    P_LEFT,
+    P_PART,
+    P_PEAK,
+    P_RIGHT,
+    P_SATURATED,
+    S_LATE,
+    S_LEFT,
+    S_PEAK,
+    S_PERIODS,
+    S_RIGHT,
+    S_SATURATED,
+    SIN,
+    THETA,
+    V,
+    X,
+    Y,
+)
+from echelon.sim.batch.streams import change_ns, hear, room, say
+
+STARTED_NS: Final = 1_000_000_000
+"""Saturation in the first second is counted apart (sim.results.measures)"""
+
+__all__ = ["is_kept", "many_runs", "whole_run"]
+
+
+@compiled
+def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
+    """Runs a plan; returns the instant at which a robot's state is not finite [ns], or -1.  What is measured is in `real` and
+    `whole` then.
+
+    `keys`: two Philox keys of each link, (links, 4), the bits of its words as integers.  `trace`: states of the robots at the
+    instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted."""
+    run = model.run[0]
+    robots, nodes, blocks, streams, links = model.robots, model.nodes, model.blocks, model.streams, model.links
+    table, index = model.table, model.indices
+    _start(run, robots, nodes, blocks, links, keys, real, whole)
+    lost_ns = -1
+    instant = 0
+    measured_ns = 0
+    for time_ns in range(0, run.duration_ns + 1, run.tick_ns):
+        for number in range(len(robots)):
+            robot = robots[number]
+            due = time_ns == whole[run.due_at + number]
+            if due and not _say_state(robot, streams[robot.stream], real, whole, time_ns):
+                lost_ns = time_ns
+        if time_ns % run.common_ns == 0:
+            measure(run, robots, nodes, blocks, table, index, real, whole, time_ns, time_ns - measured_ns)
+            measured_ns = time_ns
+            if len(trace) > instant:
+                for number in range(len(robots)):
+                    for value in range(7):
+                        trace[instant, number, value] = real[robots[number].at + value]
+            instant += 1
+        if lost_ns >= 0:
+            return lost_ns
+        for number in range(len(nodes)):
+            node = nodes[number]
+            if time_ns == whole[run.due_at + len(robots) + number]:
+                speaks = node.up >= 0 and time_ns % node.parent_period_ns == 0
+                gather(node, run, links, streams, table, index, real, whole, time_ns, speaks)
+        for number in range(len(nodes) - 1, -1, -1):
+            due = run.due_at + len(robots) + number
+            if time_ns == whole[due]:
+                steer(nodes[number], run, blocks, links, streams, table, index, real, whole, time_ns)
+                whole[due] += nodes[number].period_ns
+        for number in range(len(robots)):
+            if time_ns == whole[run.due_at + number]:
+                robot = robots[number]
+                _obey(run, robot, links[robot.link], index, real, whole, time_ns)
+                whole[run.due_at + number] += robot.period_ns
+    return lost_ns
+
+
+@compiled
+def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, due_ns: int) -> None:
+    """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
+    now_ns, end_ns = due_ns, due_ns + robot.period_ns
+    while now_ns < end_ns:
+        said, until_ns = hear(link, index, real, whole, now_ns), end_ns
+        if robot.on_arrival:
+            change = change_ns(link, whole, now_ns)
+            until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
+        if said < 0:
+            move(robot, real, now_ns, until_ns, 0.0, 0.0, False)
+        else:
+            at = said + robot.command
+            move(robot, real, now_ns, until_ns, real[at], real[at + 1], True)
+        now_ns = until_ns
+
+
+@compiled
+def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any, real: Any, whole: Any) -> None:
+    for place in range(len(real)):
+        real[place] = 0.0
+    for place in range(len(whole)):
+        whole[place] = 0
+    for number in range(len(robots)):
+        robot = robots[number]
+        real[robot.at + X] = robot.x
+        real[robot.at + Y] = robot.y
+        real[robot.at + THETA] = robot.heading
+        real[robot.at + HELD_S] = robot.h
+        real[robot.at + COS] = cos(robot.heading)
+        real[robot.at + SIN] = sin(robot.heading)
+    for number in range(len(links)):
+        marks = links[number].marks_at
+        whole[marks + IN_USE] = whole[marks + NEWEST] = whole[marks + LAST] = -1
+        whole[marks + NEXT] = FAR
+        for word in range(4):
+            whole[marks + KEY_0 + word] = keys[number, word]
+    for number in range(len(blocks)):
+        marks = blocks[number].marks_at
+        whole[marks + M_FINITE] = 1
+        for mark in range(run.fractions + 1):
+            whole[marks + M_FINITE + 1 + mark] = -1
+    real[run.distance_at] = 1e300
+    for place in range(len(robots)):
+        whole[run.order_at + place] = place
+    if run.avoidance:
+        for number in range(len(nodes)):
+            for place in range(nodes[number].robots):
+                whole[nodes[number].order_at + place] = place
+
+
+@compiled
+def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> bool:
+    """Sends a robot's state and adds up the torques of the period that ends; returns whether all of it is finite."""
+    at = robot.at
+    c, s, v, across = real[at + COS], real[at + SIN], real[at + V], robot.offset * real[at + OMEGA]
+    place = room(stream, whole)
+    real[place] = real[at + X]
+    real[place + 1] = real[at + Y]
+    real[place + 2] = v * c - across * s
+    real[place + 3] = v * s + across * c
+    say(stream, whole, time_ns, 0)
+    total = real[place] + real[place + 1] + real[place + 2] + real[place + 3] + real[at + THETA]
+    total += real[at + OMEGA] + real[at + P_RIGHT] + real[at + P_LEFT] + real[at + P_PEAK]
+    if time_ns > 0:
+        real[at + S_RIGHT] += real[at + P_RIGHT] / robot.torque_periods
+        real[at + S_LEFT] += real[at + P_LEFT] / robot.torque_periods
+        real[at + S_PEAK] = max(real[at + S_PEAK], real[at + P_PEAK])
+        real[at + S_SATURATED] += real[at + P_SATURATED]
+        real[at + S_PERIODS] += 1.0
+        if time_ns > STARTED_NS:
+            real[at + S_LATE] += real[at + P_SATURATED]
+        for place in range(at + P_RIGHT, at + P_PART):
+            real[place] = 0.0
+    return isfinite(total)
+
+
+@compiled
+def many_runs(
+    model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, traces: Any, lost_ns: Any,
+    kept_reals: Any, kept_wholes: Any, reals: Any, wholes: Any,
+) -> None:  # fmt: skip
+    """Runs number `first` to `last` - 1; copies the results of each from the scratch (`real`, `whole`) to `reals[number]` and
+    `wholes[number]`."""
+    for number in range(first, last):
+        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)])
+        for place in range(len(kept_reals)):
+            reals[number, place] = real[kept_reals[place]]
+        for place in range(len(kept_wholes)):
+            wholes[number, place] = whole[kept_wholes[place]]

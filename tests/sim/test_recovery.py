@@ -136,7 +136,7 @@ def test_of_a_run_that_was_recorded_to_its_end_only_what_is_torn_is_mended(torn:
 def test_where_nothing_was_recorded_it_says_so(tmp_path: Path) -> None:
     done = echelon("recover", tmp_path)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert done.stderr.startswith(f"echelon: {tmp_path}/run.mcap: there is none")
+    assert done.stderr.startswith(f"echelon: {tmp_path}/run.mcap: not found; a run cannot be rebuilt without it")
     (tmp_path / "run.mcap").write_text("hello")
     done = echelon("recover", tmp_path)
     assert (done.returncode, done.stderr) == (2, f"echelon: {tmp_path}/run.mcap: is no MCAP file\n")

@@ -71,7 +71,8 @@ Feeds the messages that a run recorded to today's robots and nodes, and compares
 with what was recorded.  With --set or --scenario it judges another law on the same data.
 Each role hears what was said then, not what others compute now, so a difference stays with the
 role that causes it.  Links with delay and loss deliver the same messages as in the run.
-On a wall clock this is exact where no message came late; the command says how many did.
+On a wall clock the instants of arrival are not recorded: then the outputs agree to about what
+moves within a period, and --tolerance says how much of that counts as equal.
 Parts of yours are the copies in the run's folder; --scenario FILE takes those beside that file.""",
         examples={
             "echelon replay runs/demo": "the code of today says what was recorded",

@@ -230,7 +230,7 @@ def test_on_a_wall_clock_it_says_what_is_exact(tmp_path: Path) -> None:
     assert found.equal  # what a recorder missed is no difference
     assert found.until == 0.4
     assert channel_of(found, "g2/r5", Channel.STATE).only_second == 1
-    assert "on a wall clock, and nothing says how many stages acted without a message that came late" in str(found)
+    assert "on a wall clock: when each message arrived is not recorded" in str(found)
 
 
 def test_a_recording_by_another_version_is_told(tmp_path: Path) -> None:

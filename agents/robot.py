@@ -9,6 +9,7 @@ the robot sends the wanted torques in TORQUE messages, and moves with the torque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan
+from typing import Final
 
 import numpy as np
 
@@ -19,6 +20,12 @@ from echelon.plan.layout import acceleration_of
 from echelon.plan.plan import Plan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
+
+Sums = tuple[float, float, float, float, float, float, int]
+"""Over torque periods: of both torques the sums, the sums of squares and the largest magnitudes, right wheel first; the number
+of torque periods in which a torque was limited"""
+_LOST_SUMS: Final[Sums] = (nan, nan, nan, nan, nan, nan, 0)
+"""Of a period in which the run diverged"""
 
 
 class Robot:
@@ -77,8 +84,21 @@ class Robot:
 
     def _end_period(self, time_ns: int) -> None:
         """Moves to the end of a period, and sums it up for the STATE message."""
-        self._move(time_ns)
-        self._period_values = (*(self._a or (0.0, 0.0)), *self._sums.taken(self._torque_periods))
+        count = self._torque_periods
+        if time_ns - self._moved_ns == count * self._h_ns:  # nothing arrived within the period
+            try:
+                sums = self._pass_torque_periods(count)
+            except (ValueError, OverflowError):  # the run diverged: angles and speeds overflow
+                self.state, sums = LOST, _LOST_SUMS
+            self._moved_ns = time_ns
+        else:
+            self._move(time_ns)
+            sums = self._sums.taken()
+        right, left, right_square, left_square, right_peak, left_peak, saturated = sums
+        self._period_values = (
+            *(self._a or (0.0, 0.0)), right / count, left / count, right_square / count, left_square / count,
+            right_peak, left_peak, float(saturated),
+        )  # fmt: skip
 
     def _move(self, until_ns: int) -> None:
         """Moves until an instant with the acceleration that holds."""
@@ -88,25 +108,24 @@ class Robot:
                 left_ns, whole = h_ns - now_ns % h_ns, (until_ns - now_ns) // h_ns
                 if left_ns == h_ns and whole:
                     self._moved_ns += whole * h_ns
-                    self._pass_torque_periods(whole)
+                    self._sums.add_sums(self._pass_torque_periods(whole))
                 else:  # an acceleration arrives within this torque period, or has arrived
                     span_ns = min(left_ns, until_ns - now_ns)
                     self._moved_ns += span_ns
                     self._pass_part(span_ns * 1e-9, left_ns * 1e-9, first=left_ns == h_ns)
-        except (ValueError, OverflowError):  # the run diverged: angles and speeds overflow
-            self.state = LOST
-            self._sums.lose()
-            self._moved_ns = until_ns
+        except (ValueError, OverflowError):  # the run diverged
+            self.state, self._moved_ns = LOST, until_ns
+            self._sums.add_sums(_LOST_SUMS)
 
-    def _pass_torque_periods(self, count: int) -> None:
-        """Runs the torque loop and the plant through whole torque periods."""
-        h, state, step, inverse, limits, sums = self._h, self.state, self._step, self._inverse, self._limits, self._sums
-        right_sum, left_sum, right_square, left_square = sums.right, sums.left, sums.right_square, sums.left_square
-        right_peak, left_peak, saturated = sums.right_peak, sums.left_peak, sums.saturated
+    def _pass_torque_periods(self, count: int) -> Sums:
+        """Runs the torque loop and the plant through whole torque periods; returns the sums over them."""
+        h, state, step, inverse, limits = self._h, self.state, self._step, self._inverse, self._limits
+        right_sum = left_sum = right_square = left_square = right_peak = left_peak = 0.0
+        saturated = 0
         commanded, held = self._a is not None, self._held
         ax, ay = self._a or (0.0, 0.0)
-        right = left = 0.0
         for _ in range(count):
+            right = left = 0.0
             if commanded:
                 right, left = inverse(state, ax, ay, 0.5 * h)
             if self._limited:
@@ -121,8 +140,7 @@ class Robot:
             right_peak = max(right_peak, abs(right))
             left_peak = max(left_peak, abs(left))
         self.state, self._held = state, held
-        sums.right, sums.left, sums.right_square, sums.left_square = right_sum, left_sum, right_square, left_square
-        sums.right_peak, sums.left_peak, sums.saturated = right_peak, left_peak, saturated
+        return right_sum, left_sum, right_square, left_square, right_peak, left_peak, saturated
 
     def _pass_part(self, span: float, left: float, *, first: bool) -> None:
         """Runs the torque loop and the plant through `span` [s] of a torque period of which `left` [s] are left.
@@ -167,25 +185,26 @@ class _TorqueSums:
         self.right_peak = max(self.right_peak, abs(right))
         self.left_peak = max(self.left_peak, abs(left))
 
-    def lose(self) -> None:
-        """Makes the sums NaN: the run diverged."""
-        self.right = self.left = self.right_square = self.left_square = self.right_peak = self.left_peak = nan
-        self.saturated = 0
+    def add_sums(self, sums: Sums) -> None:
+        """Adds the sums over whole torque periods."""
+        right, left, right_square, left_square, right_peak, left_peak, saturated = sums
+        self.right += right
+        self.left += left
+        self.right_square += right_square
+        self.left_square += left_square
+        self.right_peak = max(right_peak, self.right_peak)
+        self.left_peak = max(left_peak, self.left_peak)
+        self.saturated += saturated
 
-    def taken(self, count: int) -> tuple[float, float, float, float, float, float, float]:
-        """Returns mean, mean square and peak of both torques and the saturated torque periods, and begins anew."""
-        values = (
-            self.right / count,
-            self.left / count,
-            self.right_square / count,
-            self.left_square / count,
-            self.right_peak,
-            self.left_peak,
-            float(self.saturated),
+    def taken(self) -> Sums:
+        """Returns the sums, and begins anew."""
+        sums = (
+            *(self.right, self.left, self.right_square, self.left_square, self.right_peak, self.left_peak),
+            self.saturated,
         )
         self.right = self.left = self.right_square = self.left_square = self.right_peak = self.left_peak = 0.0
         self.saturated = 0
-        return values
+        return sums
 
 
 class RobotOnBus(Robot):

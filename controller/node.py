@@ -136,10 +136,11 @@ class TreeNode:
         if len(said) < len(heard):
             self._s = None
             return self._say_up(time_ns, NULL)
-        if self._brings and (
-            self._odd_clocks or any(message is not None and message.time_ns != time_ns for message in heard)
-        ):
-            said = self._brought(time_ns, heard)
+        if self._brings:
+            for message in heard:
+                if self._odd_clocks or (message is not None and message.time_ns != time_ns):
+                    said = self._brought(time_ns, heard)
+                    break
         self._s = s = np.concatenate([values[CENTROID] for values in said])
         own = self._law.up @ s
         layout = self._layout.state

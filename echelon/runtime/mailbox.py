@@ -70,28 +70,6 @@ class _Slot:
     newest: int = -1
     """The largest number of a message that has come"""
 
-    def hear(self, time_ns: int) -> Heard:
-        """Takes the newest message that has arrived, if it is newer than the one in use; returns the message in use."""
-        newer, link = self.newer, self.link
-        if self.prompt:  # as `Link.newest`, without the call
-            link.latest = number = (time_ns - self.first_ns) // self.period_ns
-        else:
-            number = link.newest(time_ns)
-        if newer and number > self.in_use:
-            message = newer.pop(number, None)
-            if message is not None:
-                if newer:  # forget the messages that this one overtakes
-                    for overtaken in range(self.in_use + 1, number):
-                        newer.pop(overtaken, None)
-                self.current, self.in_use = message, number
-        current = self.current
-        if current is None or not current.values.size:
-            return None
-        if self.timeout_ns != NEVER_NS and self.plan.read_age_ns(time_ns, current.time_ns) > self.timeout_ns:
-            return current._replace(values=np.zeros(current.values.size)) if self.plan.policy == "zero" else None
-        link.note_use(time_ns, current.sequence, current.time_ns)
-        return current
-
 
 class Mailbox:
     """All inputs of one role in virtual time.  With `paced`, a link also counts as missing while the role is `MAX_AHEAD`
@@ -200,7 +178,30 @@ class Mailbox:
 
     def take(self, stage: int, time_ns: int) -> list[Heard]:
         """Returns the messages in use at `time_ns`, one for each input of the stage; None where no message is in use."""
-        return [slot.hear(time_ns) for slot in self._stage_slots[stage]]
+        heard: list[Heard] = []
+        for slot in self._stage_slots[stage]:
+            newer, link = slot.newer, slot.link
+            if slot.prompt:  # as `Link.newest`, without the call
+                link.latest = number = (time_ns - slot.first_ns) // slot.period_ns
+            else:
+                number = link.newest(time_ns)
+            if newer and number > slot.in_use:
+                message = newer.pop(number, None)
+                if message is not None:
+                    if newer:  # forget the messages that this one overtakes
+                        for overtaken in range(slot.in_use + 1, number):
+                            newer.pop(overtaken, None)
+                    slot.current, slot.in_use = message, number
+            current = slot.current
+            if current is None or not current.values.size:
+                heard.append(None)
+            elif slot.timeout_ns != NEVER_NS and slot.plan.read_age_ns(time_ns, current.time_ns) > slot.timeout_ns:
+                zeros = slot.plan.policy == "zero"
+                heard.append(current._replace(values=np.zeros(current.values.size)) if zeros else None)
+            else:
+                link.note_use(time_ns, current.sequence, current.time_ns)
+                heard.append(current)
+        return heard
 
     def next_change(self, stage: int, time_ns: int) -> int:
         """Returns the first instant after `time_ns` at which a stage hears something newer, or at which a message in use

@@ -54,8 +54,8 @@ def _pass(robot: Any, real: Any, count: int, ax: float, ay: float, commanded: bo
     """Runs torque loop and plant through whole torque periods."""
     at, h = robot.at, robot.h
     right_square, left_square, peak = real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK]
-    right = left = 0.0
     for _ in range(count):
+        right = left = 0.0
         if commanded:
             right, left = inverse(robot, real, ax, ay, 0.5 * h)
         if robot.limited:

@@ -256,7 +256,7 @@ def test_editors_allow_parts_that_others_wrote(written: str) -> None:
 def test_the_schema_of_a_summary_is_there_too() -> None:
     assert json.loads(echelon("schema", "summary").stdout) == summary_schema()
     refused = echelon("schema", "summary", "--markdown")
-    assert refused.stderr == "echelon: --markdown: is for scenario, not for summary\n"
+    assert refused.stderr == "echelon: --markdown: is only for the schema of scenarios, not of summary\n"
 
 
 def test_the_reference_page_is_up_to_date() -> None:

@@ -22,12 +22,13 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
+from echelon.controller.late_states import LateStates
 from echelon.controller.laws.in_tree import BlockGains, NodeBlocks
 from echelon.controller.potential import PairForces, pairs_between
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import desired_shape, node_matrix
 from echelon.messages import NULL, Channel, Heard, Message, Values
-from echelon.plan.layout import CENTROID, GroupStateLayout, NodeLayout, length
+from echelon.plan.layout import CENTROID, NodeLayout
 from echelon.plan.plan import Array, NodePlan, Plan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
@@ -118,12 +119,7 @@ class TreeNode:
         )
         parents = () if node.parent is None else (Input(node.parent, Channel.REFERENCE),)
         acts = Acts.WHEN_HEARD if node.event_driven else Acts.AT_INSTANT
-        links = {(link.source, link.channel): link for link in plan.links_into(node.index)}
-        self._links = [links[child.source, child.channel] for child in children]
-        self._positions = _positions_below(plan, node)
-        self._odd_clocks = any(not link.clocks_are_true for link in self._links)
-        self._brings = plan.reference == "message"
-        """True if states of children that are older than an act of this node are brought to the present"""
+        self._late = LateStates(plan, node, self._trajectory)
         self.stages = (
             Stage(Turn.GATHER, node.period_ns, children, self._gather, acts=acts, depth=node.depth),
             Stage(Turn.STEER, node.period_ns, parents, self._steer, acts=acts, depth=node.depth),
@@ -132,15 +128,10 @@ class TreeNode:
     def _gather(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the children's states; returns the GROUP_STATE if the parent is due when the node is.  It is a null message if
         the state of a child is missing."""
-        said = [message.values for message in heard if message is not None]
+        said = self._late.present(time_ns, heard)
         if len(said) < len(heard):
             self._s = None
             return self._say_up(time_ns, NULL)
-        if self._brings:
-            for message in heard:
-                if self._odd_clocks or (message is not None and message.time_ns != time_ns):
-                    said = self._brought(time_ns, heard)
-                    break
         self._s = s = np.concatenate([values[CENTROID] for values in said])
         own = self._law.up @ s
         layout = self._layout.state
@@ -159,28 +150,6 @@ class TreeNode:
                 state[layout.centroid_rates] = own[2:4] - z_cd[2:4]
         return self._say_up(time_ns, state)
 
-    def _brought(self, time_ns: int, heard: Sequence[Heard]) -> list[Values]:
-        """Returns the values of the messages, each moved on as the reference has moved since the time of the message.
-
-        So the error that follows is that of the message's own time: p(t - τ) + z_cd(t) - z_cd(t - τ) - z_cd(t) is
-        p(t - τ) - z_cd(t - τ), and velocities likewise."""
-        said = []
-        now: Array | None = None
-        for link, places, message in zip(self._links, self._positions, heard, strict=True):
-            if message is None:
-                continue
-            values = message.values
-            age_ns = link.read_age_ns(time_ns, message.time_ns)
-            if age_ns:
-                now = self._trajectory.at(time_ns * 1e-9) if now is None else now
-                moved = now[:2] - self._trajectory.at(max(0, time_ns - age_ns) * 1e-9)[:2]
-                values = values.copy()
-                values[CENTROID] += moved.ravel()
-                for place in places:
-                    values[place] += np.tile(moved[0], length(place) // 2)
-            said.append(values)
-        return said
-
     def _steer(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """Takes the parent's reference; returns REFERENCE and COMMAND for the children.  They are null messages if the state of
         a child or the parent's reference is missing."""
@@ -194,6 +163,8 @@ class TreeNode:
         else:
             s = None
         if s is None:
+            if self._late.remembers:
+                self._late.note(time_ns, None)
             return self._say_down(time_ns, NULL, NULL)
         accelerations = law.down @ np.concatenate((s, c, all_rates)) + law.constant
         if self._blocks is not None:
@@ -205,6 +176,8 @@ class TreeNode:
             if mine is not None:
                 forces = forces + reference[mine.forces]
             accelerations += law.of_forces @ forces
+        if self._late.remembers:
+            self._late.note(time_ns, accelerations)
         if (parts := layout.reference) is None:
             return self._say_down(time_ns, NULL, accelerations)
         further = np.empty(parts.size)
@@ -229,16 +202,6 @@ class TreeNode:
         if self._layout.command is not None:
             messages.append(Message(Channel.COMMAND, self.index, number, time_ns, command))
         return tuple(messages)
-
-
-def _positions_below(plan: Plan, node: NodePlan) -> list[list[slice]]:
-    """Returns for each child where its message has positions of robots beside its centroid."""
-    found: list[list[slice]] = []
-    for child in node.children:
-        one = plan.formation[child]
-        places = [GroupStateLayout.of(plan, one).positions] if isinstance(one, NodePlan) else []
-        found.append([place for place in places if length(place)])
-    return found
 
 
 def _pair_forces(plan: Plan, node: NodePlan) -> PairForces:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf, log
 
+from echelon.controller.late_states import EXTRAPOLATE, PREDICT
 from echelon.controller.prediction.block_margin import delay_margin
 from echelon.controller.prediction.gains import PredictionError, linear_gains
 from echelon.controller.prediction.largest_delay import LargestDelay, largest_extra_delay
@@ -88,13 +89,14 @@ def analyse(plan: Plan) -> Analysis:
 
 
 def describe_untreated(links: Sequence[LinkPlan]) -> str:
-    """Returns in words how many links of which channels lose messages or have varying delays; `links` are such links."""
+    """Returns in words how many links of which channels cannot be treated, and why; `links` are such links."""
 
     def like(link: LinkPlan) -> str:
         low, high = link.delay_min_ns / 1e9, link.delay_max_ns / 1e9
         loss = [f"lose {100 * link.loss:g} % of their messages"] if link.loss else []
         delays = [f"have delays from {low:g} to {high:g} s"] if high > low else []
-        return " and ".join([*loss, *(["have delays that vary"] if link.delays else delays)])
+        policy = [f"have the policy {link.policy}"] if link.policy in (EXTRAPOLATE, PREDICT) else []
+        return " and ".join([*loss, *(["have delays that vary"] if link.delays else delays), *policy])
 
     found = Counter((link.channel.name.lower(), like(link)) for link in links)
     return ", ".join(f"{count} {channel} links {what}" for (channel, what), count in found.items())

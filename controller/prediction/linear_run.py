@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.sparse import csr_array
 
+from echelon.controller.late_states import EXTRAPOLATE, PREDICT
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, powers_of
 from echelon.controller.prediction.schedule import schedule
@@ -52,8 +53,9 @@ class Loop:
 
 
 def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
-    """Returns the links that a linear map cannot describe: they lose messages, or their delays vary."""
-    return tuple(link for link in plan.links if not link.steady)
+    """Returns the links that the linear run cannot describe: they lose messages, their delays vary, or their states are brought
+    to the present by a policy."""
+    return tuple(link for link in plan.links if not link.steady or link.policy in (EXTRAPOLATE, PREDICT))
 
 
 def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:

@@ -23,8 +23,6 @@ STATES: Final = (Channel.STATE, Channel.GROUP_STATE)
 ACCELERATIONS: Final = (Channel.COMMAND, Channel.REFERENCE)
 CHANNELS_OF_POLICY: Final = {"zero": ACCELERATIONS, "extrapolate": STATES, "predict": STATES}
 """The channels on which a policy makes sense; other policies do on all"""
-NOT_YET: Final = frozenset({"extrapolate", "predict"})
-"""Policies that a scenario can name but that no receiver follows yet"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +92,6 @@ def _fits(rule: LinkRule | Blackout, source: str, receiver: str, channel: Channe
 
 def _made(rule: LinkRule, key: str) -> _Made:
     """Returns what a rule says.  Raises PlanError."""
-    if rule.policy in NOT_YET:
-        raise PlanError(
-            f"{key}.policy = {rule.policy!r}: no receiver follows it yet; use 'hold', 'hold_then_stop' or 'zero'"
-        )
     low_ns, high_ns, delays = delays_of(rule, f"{key}.delay")
     if isinstance(rule.loss, float | int):
         return _Made(rule, key, low_ns, high_ns, delays, rule.loss, None)

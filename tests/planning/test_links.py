@@ -149,8 +149,6 @@ def test_mistakes_in_traces_name_their_line(folder: Path, delay: str, line: str)
             ".timeout: missing; policy = 'zero' needs it",
         ),
         ("policy='hold',timeout=1", ": timeout = 1.0: policy = 'hold' has none; leave it out"),
-        ("policy='predict',channel='state'", ".policy = 'predict': no receiver follows it yet"),
-        ("policy='extrapolate',channel='state'", ".policy = 'extrapolate': no receiver follows it yet"),
         ("name='Up'", ".name = 'Up': a name is a lower-case letter"),
     ],
 )

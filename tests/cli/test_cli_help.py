@@ -101,7 +101,10 @@ print(*[name for name in {heavy} if name in sys.modules])
         (("run", "lab", "--engnie", "x"), "echelon: unrecognized arguments: --engnie x"),
         (("referee", "lab", "--tolerance", "x"), "echelon referee: argument --tolerance: 'x' is no number"),
         (("new", "Ab"), "echelon: Ab.toml: name = 'Ab': a name is a lower-case letter"),
-        (("new", "a", "--groups", "0x3"), "echelon: --groups 0x3: must be the number of groups x robots in each, like 2x3"),
+        (
+            ("new", "a", "--groups", "0x3"),
+            "echelon: --groups 0x3: must be the number of groups x robots in each, like 2x3",
+        ),
         (("new", "a", "--groups", "2x"), "echelon: --groups 2x: must be"),
         (("new", "a", "--groups", "x3"), "echelon: --groups x3: must be"),
         (("new", "a", "--groups", "2,,3"), "echelon: --groups 2,,3: must be"),

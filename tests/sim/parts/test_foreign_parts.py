@@ -362,7 +362,7 @@ def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_is_named_a
     use = write(folder, "law", f"{LATER['law']}\n            {HANG}")
     done = run(folder, use, *WAYS["processes, wall clock, closed"])
     assert done.returncode == 3
-    assert "not done after 13 s: g2, which runs mine.py:Mine" in done.stderr
+    assert "not done after 14 s: g2, which runs mine.py:Mine" in done.stderr
     wheels_are_at_zero(folder / "run")
     assert summary_of(folder / "run")["can"]["robots"]["g2/r5"]["stopped"]["no command"] > 10
 

@@ -114,7 +114,8 @@ def test_links_of_every_kind_do_the_same_between_processes(tmp_path: Path) -> No
 
 
 def test_links_are_told_while_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = plan_of("lab", "duration=4.0", 'links=[{channel="state",loss=0.5}]')
+    """Processes tell their links once a second; the run is long enough that none ends before."""
+    plan = plan_of("lab", "duration=100.0", 'links=[{channel="state",loss=0.5}]')
     seen: list[int] = []
     outcome = supervised(
         plan, tmp_path, show=lambda progress: seen.append(sum(each.sent for each in progress.links.values()))

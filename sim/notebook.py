@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from echelon.sim.replay.replay import Replay
 
 
+_CHOICE: Final = re.compile(r"(?<![\w-])--(clock|engine) (virtual|wall|inprocess|processes)\b")
+"""An option with one of its values"""
 _OPTION: Final = re.compile(r"(?<![\w-])--(set (?=\S)|[a-z]+(?:-[a-z]+)*)")
 _AS_ARGUMENT: Final = {"set ": "", "replace": "replace=True", "keep-going": "keep_going=True"}
 
@@ -35,9 +37,8 @@ def _arguments_for_options() -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        lines = (
-            _OPTION.sub(lambda one: _AS_ARGUMENT.get(one[1], one[1].replace("-", "_")), line) for line in error.lines
-        )
+        lines = (_CHOICE.sub(r'\1="\2"', line) for line in error.lines)
+        lines = (_OPTION.sub(lambda one: _AS_ARGUMENT.get(one[1], one[1].replace("-", "_")), line) for line in lines)
         raise type(error)(*lines) from error.__cause__
 
 

@@ -130,7 +130,7 @@ def test_scenarios_come_from_names_files_tables_and_what_was_loaded(tmp_path: Pa
         ("lab", {"law.leed": 0.0}, "law.leed: unknown key; did you mean 'lead'?"),
         ("lab", {"law.lead": None}, "None: must be a number, a string, a boolean"),
         ({"name": "t"}, {}, "scenario: duration: missing"),
-        ("lab", {"can.virtual_drives": False, "can.path": "closed"}, "real drives need --clock wall"),
+        ("lab", {"can.virtual_drives": False, "can.path": "closed"}, 'real drives need clock="wall"'),
     ],
 )
 def test_mistakes_are_user_errors(scenario: object, changes: dict[str, object], says: str, tmp_path: Path) -> None:

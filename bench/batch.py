@@ -77,6 +77,7 @@ def plain_numpy(plan: Plan, runs: int) -> Array:
     """Runs all runs at once as numpy arrays; returns the positions at the end of the first one."""
     robot, transformation, avoidance = plan.robots[0], Transformation(plan), plan.avoidance
     law, trajectory = CentralLaw(plan), make_trajectory(plan.trajectory)
+    ahead = plan.lead * plan.root.period_ns * 1e-9
     blocks = [plan.law.made.linear(block) for block in law._blocks]
     K_1, K_2 = (np.concatenate([np.diag(getattr(gains, name))[::2] for gains in blocks]) for name in ("K_1", "K_2"))
     W = np.concatenate([np.diag(g.weight)[::2] / b.sigma for g, b in zip(blocks, law._blocks, strict=True)])
@@ -103,7 +104,7 @@ def plain_numpy(plan: Plan, runs: int) -> Array:
         e, e_dot = transformation.forward(p) - transformation.desired(z_cd[0]), transformation.forward(velocity)
         e_dot[:, -1] -= z_cd[1]
         nu = -K_1[:, None] * e - K_2[:, None] * e_dot
-        nu[:, -1] += z_cd[2]
+        nu[:, -1] += trajectory.at(time_ns * 1e-9 + ahead)[2]
         apart = apart_of @ p
         q = np.square(apart).sum(axis=-1)
         if (q < avoidance.sensing_radius**2).any():

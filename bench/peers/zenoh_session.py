@@ -15,7 +15,7 @@ TIMEOUT_S = 30.0
 
 
 class _Handler:
-    """Runs a role in the handler of the messages that it waits for, as `echelon.runtime.runner` does."""
+    """Runs a role in the handler of the messages that it waits for, as `echelon.runtime.lockstep` does."""
 
     def __init__(self, senders: dict[str, int]) -> None:
         self._waiting: dict[str, deque[bytes]] = {channel: deque() for channel in senders}

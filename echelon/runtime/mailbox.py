@@ -57,6 +57,7 @@ class _Slot:
     period_ns: int
     timeout_ns: int
     size: int | None
+    clocks_are_true: bool
     """As in `plan`; they stand here because they are read at every message"""
     ahead_ns: int | None
     """How far the role may be ahead of the newest message that has come, even if the link loses that message.  None: no limit;
@@ -87,6 +88,7 @@ class Mailbox:
                 link.period_ns,
                 link.timeout_ns,
                 link.size,
+                link.clocks_are_true,
                 max(MAX_AHEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
                 if paced and not link.prompt
                 else None,
@@ -195,7 +197,9 @@ class Mailbox:
             current = slot.current
             if current is None or not current.values.size:
                 heard.append(None)
-            elif slot.timeout_ns != NEVER_NS and slot.plan.read_age_ns(time_ns, current.time_ns) > slot.timeout_ns:
+            elif slot.timeout_ns < (
+                time_ns - current.time_ns if slot.clocks_are_true else slot.plan.read_age_ns(time_ns, current.time_ns)
+            ):
                 zeros = slot.plan.policy == "zero"
                 heard.append(current._replace(values=np.zeros(current.values.size)) if zeros else None)
             else:

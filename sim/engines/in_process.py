@@ -103,10 +103,8 @@ class Engine:
 
     def instants(self) -> Iterator[int]:
         """Runs the whole plan, from `first_ns` to its duration inclusive; yields each instant [ns] when it is done."""
-        receivers, sink = (
-            self._receivers,
-            self._sink,
-        )  # the body of `post` is repeated below, since this is the innermost loop
+        receivers, sink = self._receivers, self._sink
+        # the body of `post` is repeated below, since this is the innermost loop
         for time_ns in range(self.first_ns, self.plan.duration_ns + 1, self.tick_ns):
             for _, period_ns, first_ns, prompt, stages in self.timetable:
                 if time_ns % period_ns or time_ns < first_ns:

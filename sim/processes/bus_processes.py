@@ -33,7 +33,7 @@ from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role
-from echelon.runtime.runner import Runner
+from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, encode, join, watch_key
 from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, hear_finish, meet
@@ -99,7 +99,7 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
     station = _made(make)
     control.send(station.progress())
     role: Role = station
-    runner = Runner(role, spec.plan, session, spec.run, watched=spec.watched, virtual=True)
+    runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched)
     meet(spec, session, control)
 
     def leave(number: int, frame: object) -> None:
@@ -120,7 +120,7 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
     teller.start()
     failure: Failed | PartFailed | None = None
     try:
-        runner.lockstep(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
+        runner.run(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off, but the counts so far are still reported
         pass
     except BusError as error:

@@ -22,7 +22,8 @@ from echelon.errors import PartRunError
 from echelon.messages import Heard, Message
 from echelon.role import Role
 from echelon.runtime.link import LinkCounts
-from echelon.runtime.runner import Runner
+from echelon.runtime.lockstep import LockstepRunner
+from echelon.runtime.paced import PacedRunner
 from echelon.runtime.session import Session
 from echelon.sim.engines.in_process import make_role
 from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, meet
@@ -121,24 +122,18 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
             control.send(said)
 
     role = _LinkTeller(make_role(spec.plan, spec.index), say)
-    runner = Runner(
-        role,
-        spec.plan,
-        session,
-        spec.run,
-        watched=spec.watched,
-        virtual=spec.virtual,
-    )
+    make = LockstepRunner if spec.virtual else PacedRunner
+    runner = make(role, spec.plan, session, spec.run, watched=spec.watched)
     role.counts = runner.mailbox.counts
     start_ns = meet(spec, session, control)
     signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())
     gc.collect()
     gc.disable()  # the loop makes no reference cycles, and a pause of one role delays all others
     try:
-        if spec.virtual:
-            runner.lockstep(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
+        if isinstance(runner, LockstepRunner):
+            runner.run(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
         else:
-            runner.wall_clock(start_ns)
+            runner.run(start_ns)
     except SystemExit:  # the run breaks off; what was counted so far is still told
         pass
     finally:

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import echelon.runtime.runner
+import echelon.runtime.lockstep
+import echelon.runtime.paced
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
+from echelon.runtime.lockstep import MAX_BATCHES, LockstepRunner
 from echelon.runtime.mailbox import MAX_AHEAD
-from echelon.runtime.runner import MAX_BATCHES, Runner
+from echelon.runtime.paced import PacedRunner
 from echelon.runtime.session import Receive
 from echelon.runtime.wire import data_key, decode, encode, split
 from echelon.sim.engines.in_process import Engine, make_role
@@ -78,7 +80,7 @@ class Network:
 class Member:
     """A single runner; the test is its network.  `said` are the payloads that it sends, `batches` the batches of copies."""
 
-    def __init__(self, plan: Plan, role: Role, *, virtual: bool = True) -> None:
+    def __init__(self, plan: Plan, role: Role, kind: type[Any] = LockstepRunner) -> None:
         self.said: list[bytes] = []
         self.batches: list[bytes] = []
         self.data_gate, self.watch_gate = threading.Event(), threading.Event()
@@ -106,7 +108,7 @@ class Member:
             return SimpleNamespace(put=put)
 
         session: Any = SimpleNamespace(subscribe=subscribe, publisher=publisher)
-        self.runner = Runner(role, plan, session, RUN, watched=True, virtual=virtual)
+        self.runner = kind(role, plan, session, RUN, watched=True)
         self.thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
@@ -116,7 +118,7 @@ class Member:
             self.on_wait()
 
         try:
-            self.runner.lockstep(on_wait)
+            self.runner.run(on_wait)
         except BaseException as error:
             self.failure = error
         finally:
@@ -169,13 +171,13 @@ def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: i
     plan, digest = plan_and_digest(*wanted)
     network = Network()
     runners = [
-        Runner(make_role(plan, one.index), plan, network.session(one.name), RUN, watched=True, virtual=True)
+        LockstepRunner(make_role(plan, one.index), plan, network.session(one.name), RUN, watched=True)
         for one in plan.formation
     ]
     ended: list[int] = []
 
     def run(index: int) -> None:
-        runners[index].lockstep(lambda time_ns, sources: None)
+        runners[index].run(lambda time_ns, sources: None)
         with network.changed:
             ended.append(index)
             network.changed.notify_all()
@@ -193,7 +195,7 @@ def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: i
 
 
 def test_a_stall_names_the_members_that_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(echelon.runtime.runner, "STALL_S", 0.02)
+    monkeypatch.setattr(echelon.runtime.lockstep, "STALL_S", 0.02)
     plan, messages = story()
     leader = plan.nodes[1]
     member = Member(plan, make_role(plan, leader.index))
@@ -249,7 +251,7 @@ def test_garbage_is_counted_and_dropped() -> None:
 
 
 def test_an_observer_that_reads_nothing_blocks_the_role_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(echelon.runtime.runner, "BATCH_BYTES", 1000)
+    monkeypatch.setattr(echelon.runtime.lockstep, "BATCH_BYTES", 1000)
     plan, messages = story()
     robot = plan.robots[0]
     states = of(messages, robot.index, Channel.STATE)
@@ -305,7 +307,7 @@ def test_receiving_never_waits_for_a_put_of_the_main_thread() -> None:
 def test_a_role_whose_links_lose_everything_still_waits_for_its_sources(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(echelon.runtime.runner, "STALL_S", 0.02)
+    monkeypatch.setattr(echelon.runtime.lockstep, "STALL_S", 0.02)
     plan, messages = story(LOST)
     robot = plan.robots[0]
     member = Member(plan, make_role(plan, robot.index))
@@ -352,7 +354,7 @@ class Clock:
         return self.now_ns
 
 
-def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[tuple[int, int | None]], Runner]:
+def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[tuple[int, int | None]], PacedRunner]:
     """Runs a robot's stages on a wall clock.  Command `number` comes `delay_of(number)` [ns] after its instant, or never if
     that is None.  Returns when the robot acts, and the number of the command that it then uses."""
     plan, messages = story()
@@ -376,7 +378,7 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[tupl
     stub: Any = SimpleNamespace(index=role.index, stages=(stages[0], replace(stages[1], run=move)))
     coming = deque(sorted(payloads, key=lambda each: each[0]))
 
-    def rest(runner: Runner, until_ns: int) -> None:
+    def rest(runner: PacedRunner, until_ns: int) -> None:
         """Lets time pass until a command comes, which the handler takes, or until `until_ns`."""
         if coming and coming[0][0] <= max(until_ns, clock.now_ns):
             came_ns, payload = coming.popleft()
@@ -386,10 +388,10 @@ def on_the_clock(delay_of: Callable[[int], int | None]) -> tuple[Plan, list[tupl
             clock.now_ns = max(clock.now_ns, until_ns)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(echelon.runtime.runner, "time", clock)
-        patch.setattr(Runner, "_rest", rest)
-        member = Member(plan, stub, virtual=False)
-        member.runner.wall_clock(start_ns)
+        patch.setattr(echelon.runtime.paced, "time", clock)
+        patch.setattr(PacedRunner, "_rest", rest)
+        member = Member(plan, stub, PacedRunner)
+        member.runner.run(start_ns)
     assert member.watched() == member.said
     assert clock.now_ns >= start_ns + plan.duration_ns
     return plan, acts, member.runner
@@ -429,12 +431,34 @@ def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
     assert runner.counts.latest_ns == 0  # stages ran at their deadline, not after it
 
 
+def test_on_a_clock_a_command_that_comes_before_the_start_is_known_is_used() -> None:
+    plan, messages = story()
+    robot, start_ns, clock = plan.robots[0], 1_000_000_000, Clock()
+    role = make_role(plan, robot.index)
+    used: list[int | None] = []
+
+    def obey(time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
+        used.append(None if heard[0] is None else heard[0].sequence)
+        return ()
+
+    stub: Any = SimpleNamespace(index=role.index, stages=(role.stages[0], replace(role.stages[1], run=obey)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(echelon.runtime.paced, "time", clock)
+        patch.setattr(
+            PacedRunner, "_rest", lambda runner, until_ns: setattr(clock, "now_ns", max(clock.now_ns, until_ns))
+        )
+        member = Member(plan, stub, PacedRunner)
+        member.receive(next(iter(of(messages, robot.parent, Channel.COMMAND))))
+        member.runner.run(start_ns)
+    assert used[0] == 0
+
+
 def test_keys_of_the_inputs_of_a_member() -> None:
     plan = story()[0]
     heard: list[str] = []
     session: Any = SimpleNamespace(
         subscribe=lambda keys, receive: heard.extend(keys), publisher=lambda key: SimpleNamespace(put=lambda data: None)
     )
-    Runner(make_role(plan, plan.nodes[1].index), plan, session, RUN, watched=False, virtual=True)
+    LockstepRunner(make_role(plan, plan.nodes[1].index), plan, session, RUN, watched=False)
     g1 = [data_key(RUN, plan.formation[child].path, Channel.STATE) for child in plan.nodes[1].children]
     assert heard == sorted([*g1, data_key(RUN, "", Channel.REFERENCE)])

@@ -1,0 +1,127 @@
+"""Runs one role paced by a clock, in real time.
+
+A stage runs in Zenoh's thread, with the message that completes its inputs.  The main thread wakes at each instant and each
+deadline.  A stage whose deadline has come runs with the newest messages that have come, and is counted as late if one was
+missing (`echelon.runtime.mailbox.WallMailbox`).
+"""
+
+import time
+
+from echelon.messages import Message
+from echelon.plan.plan import Plan
+from echelon.role import Acts, Role, Stage
+from echelon.runtime.mailbox import WallMailbox
+from echelon.runtime.runner import Runner
+from echelon.runtime.session import Session
+from echelon.runtime.turns import deadline_ns
+
+
+class PacedRunner(Runner):
+    """One role of a plan on a wall clock."""
+
+    def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool) -> None:
+        self._inbox = WallMailbox(role, plan)
+        self._started = False
+        self._start_ns = 0  # run time 0 in `time.monotonic_ns`
+        self._has_acted = False  # the stage at `_at` has acted, and acts again when something arrives
+        self._changed_ns = 0  # run time of its last act
+        self._allowed_ns = [
+            deadline_ns(plan, stage.turn, stage.depth, stage.period_ns)
+            if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT)
+            else stage.period_ns - 1
+            for stage in role.stages
+        ]
+        """For each stage how long after it is due it acts at the latest [ns]"""
+        super().__init__(role, plan, session, run, self._inbox, watched=watched, batch_bytes=0)
+
+    def run(self, start_ns: int) -> None:
+        """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
+
+        A stage runs in the handler of the message that completes its inputs.  At its deadline it runs with the messages that
+        have come: at the end of its period, or at the deadline of its turn (`echelon.runtime.turns`).
+        """
+        self._start_ns, self._started = start_ns, True
+        while True:
+            with self._lock:
+                self._take_aside()
+                wake_ns = self._pace()
+            if self._failure is not None:
+                raise self._failure
+            if self._finished:
+                return
+            self._rest(wake_ns)
+
+    def _pace(self) -> int:
+        """Runs the stages that are due; returns the instant of `time.monotonic_ns` at which it must be called again, even if
+        nothing is received until then."""
+        mailbox, counts, start_ns = self._inbox, self.counts, self._start_ns
+        while not self._finished:
+            due_ns = self._time_ns
+            if time.monotonic_ns() - start_ns < due_ns:
+                return start_ns + due_ns
+            for number, stage in self._stages[self._at :]:
+                self._at = number
+                if due_ns % stage.period_ns:
+                    continue
+                if not self._has_acted:
+                    deadline_ns = due_ns + self._allowed_ns[number]
+                    ready_ns, missed = mailbox.ready(number, due_ns, deadline_ns)
+                    now_ns = time.monotonic_ns() - start_ns
+                    if now_ns < ready_ns:
+                        return start_ns + ready_ns
+                    counts.late += missed and due_ns < self.plan.duration_ns  # at the end nobody waits any more
+                    counts.stages += 1
+                    if stage.inputs:
+                        counts.latest_ns = max(counts.latest_ns, now_ns - deadline_ns)
+                    self._act(number, stage, now_ns)
+                if stage.acts is Acts.ON_ARRIVAL and due_ns < self.plan.duration_ns:
+                    self._has_acted = True
+                    wake_ns = self._on_arrivals(number, stage)
+                    if wake_ns is not None:
+                        return start_ns + wake_ns
+                    self._has_acted = False
+            self._at = 0
+            self._time_ns += self._tick_ns
+            self._finished = self._time_ns > self.plan.duration_ns
+            if self._copies is not None:
+                self._copies.close()
+                self._copies.send()
+        return start_ns + self._time_ns
+
+    def _act(self, number: int, stage: Stage, now_ns: int) -> None:
+        """Lets a stage act now, at a run time within the period that began when it was due."""
+        at_ns = due_ns = self._time_ns
+        if stage.acts in (Acts.WHEN_HEARD, Acts.ON_ARRIVAL):
+            at_ns = min(max(now_ns, due_ns), due_ns + stage.period_ns - 1)
+        self._changed_ns = max(at_ns, now_ns)
+        for message in stage.run(at_ns, self._inbox.take(number, self._changed_ns)):
+            self._send(message)
+
+    def _on_arrivals(self, number: int, stage: Stage) -> int | None:
+        """Lets a stage act on what has arrived since its last act; returns the run time at which this must be called again, or
+        None if its period is over."""
+        end_ns = self._time_ns + stage.period_ns
+        while (now_ns := time.monotonic_ns() - self._start_ns) < end_ns:
+            change_ns = self._inbox.next_change(number, self._changed_ns)
+            if change_ns > now_ns:
+                return min(change_ns, end_ns)
+            self._act(number, stage, now_ns)
+        self.counts.late += self._inbox.misses(number, self._time_ns)
+        return None
+
+    def _take(self, message: Message) -> None:
+        # what comes before the start is known counts as having come when it was sent
+        self._inbox.receive(message, time.monotonic_ns() - self._start_ns if self._started else message.time_ns)
+
+    def _go_on(self) -> None:
+        if self._started and self._failure is None:
+            self._pace()
+
+    def _rest(self, until_ns: int) -> None:
+        """Sleeps until an instant of `time.monotonic_ns`, or until the main thread has work."""
+        self._idle = True
+        if self._stopping:
+            raise SystemExit(0)
+        self._wake.wait(max(0, until_ns - time.monotonic_ns()) * 1e-9)
+        self._wake.clear()
+        self._idle = False

@@ -18,7 +18,7 @@ def speakers(plan: Plan, virtual: bool, has_bus: bool) -> range:
 
 
 class TimeOrder:
-    """Releases messages in the order (time, source, channel, sequence): each when every source has sent a later message.
+    """Releases messages in the order (time, source, channel): each when every source has sent a later message.
 
     Each source must send in order of time.  The order of the released messages does not depend on the order of arrival."""
 
@@ -58,7 +58,7 @@ class TimeOrder:
         released: list[Message] = []
         for time_ns in sorted(time_ns for time_ns in self._waiting if time_ns < safe_ns):
             bucket = self._waiting.pop(time_ns)
-            bucket.sort(key=lambda message: (message.source, message.channel, message.sequence))
+            bucket.sort(key=lambda message: (message.source, message.channel))
             released.extend(bucket)
             self._released_ns = time_ns
         return released

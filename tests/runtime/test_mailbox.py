@@ -42,11 +42,12 @@ def mailbox_of(
     *,
     kind: type[Any] = Mailbox,
     acts: Acts = Acts.IN_TURN,
+    duration_ns: int = NEVER_NS,
 ) -> Any:
     """Returns the mailbox of a role whose stages each have all links as inputs."""
     inputs = tuple(Input(link.source, link.channel) for link in links)
     stages = stages or [Stage(Turn.ACT, PERIOD, inputs, lambda time_ns, heard: (), acts=acts)]
-    plan: Any = _Plan(tuple(links), seed)
+    plan: Any = _Plan(tuple(links), seed, duration_ns)
     role: Any = SimpleNamespace(index=RECEIVER, stages=tuple(stages))
     return kind(role, plan)
 
@@ -354,6 +355,17 @@ def test_an_input_that_comes_after_the_period_does_not_make_others_come_sooner()
     for link in links:  # both are sent at the end of the period, and arrive in the next one
         mailbox.deliver(message_of(link, 0)._replace(time_ns=PERIOD - 1))
     assert act_of(mailbox, 0) == (PERIOD - 1, [None, None])
+
+
+def test_nothing_acts_after_the_end_of_the_run():
+    """At the end nobody waits for what arrives later: a lockstep would wait for messages that are never sent."""
+    for acts in (Acts.WHEN_HEARD, Acts.ON_ARRIVAL):
+        mailbox = mailbox_of([delayed(0, 4)], acts=acts, duration_ns=2 * PERIOD)
+        for n in range(2):
+            mailbox.deliver(message_of(delayed(0, 4), n))
+            mailbox.acts(0, n * PERIOD)
+        assert mailbox.missing(0, 2 * PERIOD) == []  # message 2 has not come
+        assert act_of(mailbox, 2 * PERIOD) == (2 * PERIOD, [1])
 
 
 def test_messages_of_a_late_sender_arrive_their_delay_after_they_were_sent():

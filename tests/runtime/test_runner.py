@@ -434,6 +434,7 @@ def test_on_a_clock_the_newest_is_used_and_lateness_counted() -> None:
 def test_on_a_clock_a_command_that_comes_before_the_start_is_known_is_used() -> None:
     plan, messages = story()
     robot, start_ns, clock = plan.robots[0], 1_000_000_000, Clock()
+    clock.now_ns = start_ns - 10
     role = make_role(plan, robot.index)
     used: list[int | None] = []
 

@@ -25,6 +25,8 @@ FILES = {
     "head.txt": "delay\n",
     "back.csv": "time,delay\n0,0.1\n1,0.2\n1,0.1\n",
     "other.csv": "a,b\n0,1\n",
+    "no_time.csv": "time,delay\n0,0.1\nlost,0.2\n",
+    "late_time.csv": "0,0.1\n1e7,0.2\n",
     "infinite.txt": "0.1\ninf\n",
     "ragged.csv": "0,0.1\n0.2\n",
     "long.txt": "1e7\n",
@@ -90,6 +92,11 @@ def test_traces(folder: Path, delay: str, expected: DelayTrace) -> None:
             "{file='back.csv',by='time'}",
             ".file = 'back.csv': line 4: time 1 must be later than that of the line before",
         ),
+        ("{file='no_time.csv',by='time'}", ".file = 'no_time.csv': line 3: 'lost' must be a number\n"),
+        (
+            "{file='late_time.csv',by='time'}",
+            ".file = 'late_time.csv': line 2: time 1e7 must be a number from -1e+06 to 1e+06",
+        ),
         ("{file='good.txt',by='time'}", ".file = 'good.txt': by = 'time' needs a column called time"),
         ("{file='none.txt'}", ".file: FOLDER/none.txt: No such file or directory"),
         ("{file='.'}", ".file: FOLDER: Is a directory"),
@@ -104,7 +111,7 @@ def test_mistakes_in_traces_name_their_line(folder: Path, delay: str, line: str)
     with pytest.raises(ScenarioError) as caught:
         plan_of(folder, f"links=[{{delay={delay}}}]")
     (said,) = caught.value.lines
-    assert f": links.0.delay{line.replace('FOLDER', str(folder))}" in said
+    assert f": links.0.delay{line.replace('FOLDER', str(folder))}" in f"{said}\n"  # a line break stands for the end
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from echelon.plan.plan import Plan
 from echelon.sim.replay.comparison import ChannelComparison, Difference, compare, earliest
 from echelon.sim.replay.rendering import comparison_json, comparison_text, difference_json, difference_text
 from echelon.sim.replay.value_names import value_names
-from echelon.sim.results.recorded import Recorded, last_ns
+from echelon.sim.results.recorded import Recorded, last_instant_ns
 
 _COARSE: Final = "where periods differ, messages of the same time are compared, and those in between are left out"
 
@@ -114,7 +114,7 @@ def difference(
         raise UsageError(f"{names[0]}, {names[1]}: have no member of the same path: nothing can be compared")
     return RunDifference(
         names,
-        last_ns(first.plan, until_ns) / 1e9,
+        last_instant_ns(first.plan, until_ns) / 1e9,
         tolerance,
         tuple(channels),
         earliest(first.plan, channels),
@@ -152,4 +152,4 @@ def _remarks(runs: Sequence[Recorded], names: Sequence[str], ends_ns: Sequence[i
 
 
 def _seconds(plan: Plan, until_ns: int) -> str:
-    return f"{last_ns(plan, until_ns) / 1e9:.9g}"
+    return f"{last_instant_ns(plan, until_ns) / 1e9:.9g}"

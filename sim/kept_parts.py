@@ -4,12 +4,16 @@ run again from there."""
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from echelon.plugins import Source
 from echelon.scenario.link_tables import Trace
 from echelon.scenario.part_fields import parts_in
 from echelon.scenario.tables import Scenario
 from echelon.sim.results.records import PartResult
+
+HASH_OF: Final = "sha256 of "
+"""How a key of a recording's metadata begins that holds the SHA-256 of a file"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +33,7 @@ class KeptParts:
     @property
     def metadata(self) -> dict[str, str]:
         """The SHA-256 of each file, for the metadata of the recording."""
-        return {f"sha256 of {name}": source.sha256 for source, name in self.names.items()}
+        return {f"{HASH_OF}{name}": source.sha256 for source, name in self.names.items()}
 
 
 def keep_parts(scenario: Scenario, folder: Path, reserved: Iterable[str] = ()) -> KeptParts:

@@ -10,6 +10,7 @@ from typing import Final
 from echelon.errors import PartRunError, UsageError, UserError
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE, scenario_path
+from echelon.sim.kept_parts import HASH_OF
 from echelon.sim.out_folder import RECORDING
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.loading import load, parse
@@ -23,7 +24,6 @@ from echelon.sim.results.recorded import Recorded
 
 PATIENCE_S: Final = 30.0
 """How long a part that is not built in may take for one instant of a replay [s]"""
-_HASH: Final = "sha256 of "
 
 
 def open_recorded(folder: Path) -> Recorded:
@@ -103,9 +103,10 @@ def _remarks(recorded: Recorded, folder: Path) -> Iterator[str]:
     if not scenario.is_file() or scenario.read_bytes() != recorded.scenario.encode():
         yield f"{scenario} is not the scenario that the run used"
     for key, digest in then.items():
-        path = folder / Path(key.removeprefix(_HASH)).name
-        if key.startswith(_HASH) and (not path.is_file() or sha256(path.read_bytes()).hexdigest() != digest):
-            yield f"{path} is not the file that the run used"
+        if key.startswith(HASH_OF):
+            path = folder / Path(key.removeprefix(HASH_OF)).name
+            if not path.is_file() or sha256(path.read_bytes()).hexdigest() != digest:
+                yield f"{path} is not the file that the run used"
     if recorded.by_arrival:
         yield (
             "on a wall clock: when each message arrived is not recorded, so the replay uses it at its nominal instant; outputs "

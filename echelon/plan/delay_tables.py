@@ -24,8 +24,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.plan.can_plan import NEVER_NS
-
 Words = NDArray[np.int64]
 """Whole numbers; draws have 53 bits"""
 
@@ -59,7 +57,7 @@ LOST: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class DelayTable:
-    """Delays of a distribution.  Equal objects of a plan are one object."""
+    """Delays of a distribution.  Equal tables of a plan are one object."""
 
     delays_ns: tuple[int, ...]
     """At the edges of the grid over u, or over z if the delays are correlated; ascending [ns]"""
@@ -130,7 +128,7 @@ def merged(windows: list[tuple[int, int]]) -> Windows:
         if found and begin <= found[-1][1]:
             found[-1] = found[-1][0], max(end, found[-1][1])
         else:
-            found.append((begin, min(end, NEVER_NS)))
+            found.append((begin, end))
     return tuple(found)
 
 

@@ -33,7 +33,7 @@ def delays_of(rule: LinkRule, key: str) -> tuple[int, int, DelayTable | DelayTra
     None: they are constant, or uniform between the two."""
     delay = rule.delay
     if isinstance(delay, Trace):
-        trace = read_trace(delay, key)
+        trace = _measured(delay, key)
         come = [each for each in trace.delays_ns if each != LOST] or [0]
         return min(come), max(come), trace
     if isinstance(delay, Uniform):
@@ -110,7 +110,7 @@ def _normal(z: Array) -> Array:
     return np.array([erfc(-each / sqrt(2)) / 2 for each in z.tolist()])
 
 
-def read_trace(trace: Trace, key: str) -> DelayTrace:
+def _measured(trace: Trace, key: str) -> DelayTrace:
     """Returns the delays of a trace file.  Raises PlanError that names the line."""
     where = f"{key}.file = {trace.file.name!r}"
     rows = list(_rows(trace.file.text))
@@ -139,7 +139,7 @@ def read_trace(trace: Trace, key: str) -> DelayTrace:
 
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yields the lines of a trace that are not empty and no remarks: the number of the line, and its values."""
+    """Yields each line of a trace that holds values: its number, and its values.  Empty lines and remarks hold none."""
     for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):
         if said := line.partition("#")[0].strip():
             yield number, [cell.strip() for cell in said.replace(";", ",").split(",")]
@@ -157,7 +157,7 @@ def _delay_ns(cell: str, where: str) -> int:
     """Returns a delay of a trace [ns], or `LOST`.  Raises PlanError."""
     if cell.lower() == LOST_WORD:
         return LOST
-    value = _number(cell, where)
+    value = _number(cell, where, f"a number, or {LOST_WORD!r}")
     if not 0 <= value <= MAX_DELAY:
         raise PlanError(f"{where}: delay {cell} must be a number from 0 to {MAX_DELAY:g}, or {LOST_WORD!r}")
     return round(value * 1e9)
@@ -165,18 +165,18 @@ def _delay_ns(cell: str, where: str) -> int:
 
 def _time_ns(cell: str, where: str) -> int:
     """Returns an instant of a trace [ns].  Raises PlanError."""
-    value = _number(cell, where)
+    value = _number(cell, where, "a number")
     if not abs(value) <= MAX_DELAY:
         raise PlanError(f"{where}: time {cell} must be a number from {-MAX_DELAY:g} to {MAX_DELAY:g}")
     return round(value * 1e9)
 
 
-def _number(cell: str, where: str) -> float:
-    """Returns a finite number of a trace.  Raises PlanError."""
+def _number(cell: str, where: str, allowed: str) -> float:
+    """Returns a finite number of a trace.  Raises PlanError, which says what is `allowed`."""
     try:
         value = float(cell)
     except ValueError:
-        raise PlanError(f"{where}: {cell[:40]!r} must be a number, or {LOST_WORD!r}") from None
+        raise PlanError(f"{where}: {cell[:40]!r} must be {allowed}") from None
     if not isfinite(value):
         raise PlanError(f"{where}: {cell} must be a finite number")
     return value

@@ -128,8 +128,6 @@ _THERE_ALREADY: Final = (
 )
 _INDEX = re.compile(r"\s*\[\s*([0-9]{1,9})\s*\](?=\s*(?:[.\[]|$))")
 """The number of an array's entry in brackets, at the end of a chunk of a key"""
-
-
 _LINK = re.compile(r"links\.([0-9]{1,9})(?![0-9A-Za-z_-])")
 """The key of a rule of links, at the beginning of a text"""
 _NAME = re.compile(r"[a-z][a-z0-9_-]*")
@@ -169,14 +167,16 @@ def _override(table: dict[str, Any], override: str) -> str:
 
 
 def _numbered(table: dict[str, Any], chunks: Sequence[str]) -> list[str]:
-    """Returns a path of keys with numbers for names of entries, and with the numbers that were left out.  Raises OverrideError
-    if neither names an entry."""
+    """Returns a path of keys in which entries of arrays of tables have their numbers: in place of their names, and where the
+    number of an only entry was left out.
+
+    Raises OverrideError if neither a name nor a number is given, and the array has not just one entry."""
     path: list[str] = []
     at: Any = table
     for chunk in chunks:
         if not _is_number(chunk) and is_array(path, Scenario) and (at is None or _holds_tables(at)):
             entries = at or []
-            if (named := [number for number, entry in enumerate(entries) if entry.get("name") == chunk])[:1]:
+            if named := [number for number, entry in enumerate(entries) if entry.get("name") == chunk]:
                 path.append(str(named[0]))
                 at = entries[named[0]]
                 continue

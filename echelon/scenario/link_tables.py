@@ -57,8 +57,8 @@ class Uniform(Table):
 
 
 class Normal(Table):
-    """A random delay, normal and cut at its smallest value: of the delays below `min` none comes, and the others are so much
-    more frequent."""
+    """A random delay with a truncated normal distribution: no delay is below `min`, and those above have the density of the
+    normal distribution, scaled so that all probabilities add up to 1."""
 
     kind: Literal["normal"]
     """Kind of this delay"""
@@ -206,7 +206,7 @@ class LinkRule(Table):
     loss_of: Literal["receiver", "message"] = "receiver"
     """What is lost at once, where a source has several receivers: a message for one `receiver`, or the `message` for all"""
     duplicates: Fraction = 0.0
-    """Probability that a message that is not lost comes twice; the second copy has a delay of its own"""
+    """Probability that a message that is not lost comes twice; the second copy has a delay of its own, except with a trace"""
     order: Literal["any", "fifo"] = "any"
     """`any`: a message may overtake another one.  `fifo`: it arrives no earlier than those before it"""
     policy: Policy | None = None

@@ -113,8 +113,7 @@ def read_links(path: Path) -> list[tuple[int, LinkCounts]]:
     found = []
     with blame(path):
         for _, time_ns, data in _messages(path, {LINKS}, "echelon_msgs/LinkStatistics"):
-            at = len(ros.stamp(0)) + 8  # the empty frame_id
-            source, receiver, channel = _LINK.unpack_from(data, at)
+            source, receiver, channel = _LINK.unpack_from(data, ros.STAMP_SIZE + 8)  # after the empty frame_id
             counts = _COUNTS.unpack(data[-_COUNTS.size :])
             found.append((time_ns, LinkCounts(source, receiver, MessageChannel(channel), *counts)))
     return found

@@ -13,7 +13,7 @@ from echelon.plan.plan import Plan
 from echelon.sim.recording.mcap_reader import CutError, blame, check_type, records
 from echelon.sim.recording.mcap_writer import METADATA
 from echelon.sim.recording.recorder import NULLS, SCENARIO, routes
-from echelon.sim.recording.ros import NULL_MESSAGE, Splice, stamp
+from echelon.sim.recording.ros import NULL_MESSAGE, STAMP_SIZE, Splice
 from echelon.sim.results.recorded import Recorded, Series
 
 _NUMBERS: Final = 1 << 32
@@ -67,10 +67,11 @@ class _Nulls:
 
     def add(self, topic: str, message: Message) -> None:
         """Takes a message.  Raises ValueError if it has another shape, or its source sends nothing on its channel."""
-        at = len(stamp(0))
-        if len(message.data) != at + NULL_MESSAGE.size:
-            raise ValueError(f"a message of {topic} has {len(message.data)} bytes, not {at + NULL_MESSAGE.size}")
-        _, source, channel, sequence = NULL_MESSAGE.unpack_from(message.data, at)
+        if len(message.data) != STAMP_SIZE + NULL_MESSAGE.size:
+            raise ValueError(
+                f"a message of {topic} has {len(message.data)} bytes, not {STAMP_SIZE + NULL_MESSAGE.size}"
+            )
+        _, source, channel, sequence = NULL_MESSAGE.unpack_from(message.data, STAMP_SIZE)
         if channel >= 16 or 16 * source + channel not in self._known:
             raise ValueError(f"{topic} names source {source} and channel {channel}, which are not of this plan")
         self.found.setdefault((source, MessageChannel(channel)), {})[sequence] = message.log_time

@@ -23,8 +23,11 @@ WORLD: Final = "world"
 ARROW, SPHERE, LINE_STRIP = 0, 2, 4
 
 
+STAMP_SIZE: Final = 12
+
+
 def stamp(time_ns: int) -> bytes:
-    """Returns the beginning of a message with a header: encapsulation and stamp, 12 bytes."""
+    """Returns the beginning of a message with a header: encapsulation and stamp, `STAMP_SIZE` bytes."""
     return ENCAPSULATION + struct.pack("<iI", *divmod(time_ns, 1_000_000_000))
 
 
@@ -111,6 +114,7 @@ class Splice:
             if start > end:
                 self._rest.append((body[end:start], at, at + next_end - start))
                 at += next_end - start
+        self._message_size = STAMP_SIZE + len(self._first) + self.size + sum(len(each) for each, _, _ in self._rest)
 
     def encode(self, head: bytes, values: bytes) -> bytes:
         """Returns the message; `head` is from `stamp`, `values` are `size` bytes."""
@@ -123,10 +127,9 @@ class Splice:
 
     def decode(self, message: bytes) -> bytes:
         """Returns the values of a message that `encode` made.  Raises ValueError if its size or a constant part is another."""
-        at = len(stamp(0)) + len(self._first)
-        size = at + self.size + sum(len(constant) for constant, _, _ in self._rest)
-        if len(message) != size:
-            raise ValueError(f"has {len(message)} bytes, not {size}")
+        if len(message) != self._message_size:
+            raise ValueError(f"has {len(message)} bytes, not {self._message_size}")
+        at = STAMP_SIZE + len(self._first)
         values = message[at : at + self._end]
         at += self._end
         for constant, start, end in self._rest:

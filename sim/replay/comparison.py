@@ -90,7 +90,8 @@ def compare(
     (one, names), (other, other_names) = first, second
     keys, other_keys = (one.times_ns, other.times_ns) if by_time else (one.sequences, other.sequences)
     _, rows, other_rows = np.intersect1d(keys, other_keys, assume_unique=not by_time, return_indices=True)
-    shared = [name for name in names if name in set(other_names)]
+    in_both = set(names) & set(other_names)
+    shared = [name for name in names if name in in_both]
     a = one.values[rows][:, [names.index(name) for name in shared]]
     b = other.values[other_rows][:, [other_names.index(name) for name in shared]]
     distances = _distances(a, b)
@@ -130,7 +131,7 @@ def compare(
         len(alone[1]),
         min(found, key=lambda difference: difference.time_ns, default=None),
         largest,
-        tuple(name for name in (*names, *other_names) if name not in set(shared)),
+        tuple(name for name in (*names, *other_names) if name not in in_both),
     )
 
 

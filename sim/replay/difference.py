@@ -8,11 +8,11 @@ from echelon.errors import UsageError
 from echelon.messages import Channel
 from echelon.plan.plan import Plan
 from echelon.sim.replay.comparison import ChannelComparison, Difference, compare, earliest
-from echelon.sim.replay.rendering import comparison_json, comparison_text, difference_text
+from echelon.sim.replay.rendering import comparison_json, comparison_text, difference_json, difference_text
 from echelon.sim.replay.value_names import value_names
-from echelon.sim.results.recorded import Recorded, last_ns
+from echelon.sim.results.recorded import Recorded, last_instant_ns
 
-_COARSE: Final = "where periods differ, messages of the same time are compared, and those in between left out"
+_COARSE: Final = "where periods differ, messages of the same time are compared, and those in between are left out"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +50,7 @@ class RunDifference:
             "until": self.until,
             "tolerance": self.tolerance,
             "equal": self.equal,
-            "first_difference": None
-            if self.first_difference is None
-            else comparison_json(self.first_difference, words),
+            "first_difference": difference_json(self.first_difference, words),
             "channels": [comparison_json(channel, words) for channel in self.channels],
             "only_first_run": list(self.only_first),
             "only_second_run": list(self.only_second),
@@ -87,8 +85,8 @@ def difference(
     """Compares two runs, member by member and channel by channel; members belong together by their paths.
 
     Messages belong together by their sequence numbers; where the periods differ, by their times, and the messages in between
-    are left out.  Runs of different lengths
-    are compared up to the end of the shorter one.  Raises UsageError if that leaves nothing to compare."""
+    are left out.  Runs of different lengths are compared up to the end of the shorter one.  Raises UsageError if that leaves
+    nothing to compare."""
     ends_ns = first.whole_until_ns(), second.whole_until_ns()
     until_ns = min(ends_ns)
     if until_ns <= 0:
@@ -116,7 +114,7 @@ def difference(
         raise UsageError(f"{names[0]}, {names[1]}: have no member of the same path: nothing can be compared")
     return RunDifference(
         names,
-        last_ns(first.plan, until_ns) / 1e9,
+        last_instant_ns(first.plan, until_ns) / 1e9,
         tolerance,
         tuple(channels),
         earliest(first.plan, channels),
@@ -154,4 +152,4 @@ def _remarks(runs: Sequence[Recorded], names: Sequence[str], ends_ns: Sequence[i
 
 
 def _seconds(plan: Plan, until_ns: int) -> str:
-    return f"{last_ns(plan, until_ns) / 1e9:.9g}"
+    return f"{last_instant_ns(plan, until_ns) / 1e9:.9g}"

@@ -88,32 +88,39 @@ def _distance(difference: Difference) -> float | None:
     return size if isfinite(size) else None
 
 
-def comparison_json(what: ChannelComparison | Difference, words: Words) -> dict[str, Any]:
-    """Returns a comparison or a difference as JSON has it; a value that is not finite is a string."""
+def difference_json(difference: Difference | None, words: Words) -> dict[str, Any] | None:
+    """Returns a difference as JSON has it, None for None; a value that is not finite is a string."""
+    if difference is None:
+        return None
     first, second = words
-    if isinstance(what, Difference):
-        return {
-            "time": what.time,
-            "sequence": what.sequence,
-            "member": what.member,
-            "channel": what.channel.name.lower(),
-            "value": what.value or None,
-            first: _value(what.first),
-            second: _value(what.second),
-            "lacking": {"": None, "first": first, "second": second}[what.lacking],
-        }
     return {
-        "member": what.member,
-        "channel": what.channel.name.lower(),
-        "compared": what.compared,
-        "equal": what.equal,
-        f"only_{first}": what.only_first,
-        f"only_{second}": what.only_second,
-        "first_difference": None if what.first_difference is None else comparison_json(what.first_difference, words),
-        "largest": None
-        if what.largest is None
-        else {**comparison_json(what.largest, words), "difference": _distance(what.largest)},
-        "unshared": list(what.unshared),
+        "time": difference.time,
+        "sequence": difference.sequence,
+        "member": difference.member,
+        "channel": difference.channel.name.lower(),
+        "value": difference.value or None,
+        first: _value(difference.first),
+        second: _value(difference.second),
+        "lacking": {"": None, "first": first, "second": second}[difference.lacking],
+    }
+
+
+def comparison_json(channel: ChannelComparison, words: Words) -> dict[str, Any]:
+    """Returns the comparison of a channel as JSON has it."""
+    first, second = words
+    largest = difference_json(channel.largest, words)
+    if largest is not None and channel.largest is not None:
+        largest["difference"] = _distance(channel.largest)
+    return {
+        "member": channel.member,
+        "channel": channel.channel.name.lower(),
+        "compared": channel.compared,
+        "equal": channel.equal,
+        f"only_{first}": channel.only_first,
+        f"only_{second}": channel.only_second,
+        "first_difference": difference_json(channel.first_difference, words),
+        "largest": largest,
+        "unshared": list(channel.unshared),
     }
 
 

@@ -13,9 +13,9 @@ from echelon.plan.layout import message_sizes_of
 from echelon.plan.plan import LinkPlan, Plan
 from echelon.sim.replay.comparison import ChannelComparison, Difference, compare, earliest
 from echelon.sim.replay.feeding import Feeding
-from echelon.sim.replay.rendering import comparison_json, comparison_text, difference_text
+from echelon.sim.replay.rendering import comparison_json, comparison_text, difference_json, difference_text
 from echelon.sim.replay.value_names import value_names
-from echelon.sim.results.recorded import Recorded, Series, last_ns
+from echelon.sim.results.recorded import Recorded, Series, last_instant_ns
 
 WORDS = "recorded", "computed"
 """What the two sides of the comparison are called"""
@@ -54,9 +54,7 @@ class Replay:
             "until": self.until,
             "tolerance": self.tolerance,
             "equal": self.equal,
-            "first_difference": None
-            if self.first_difference is None
-            else comparison_json(self.first_difference, WORDS),
+            "first_difference": difference_json(self.first_difference, WORDS),
             "channels": [comparison_json(channel, WORDS) for channel in self.channels],
             "remarks": list(self.remarks),
         }
@@ -146,7 +144,7 @@ class Replaying:
         self._until_ns = min(recorded.whole_until_ns(), plan.duration_ns + 1)
         if self._until_ns <= 0:
             raise UsageError("the recording lacks messages from the start: nothing can be replayed")
-        self._until_s = last_ns(plan, self._until_ns) / 1e9
+        self._until_s = last_instant_ns(plan, self._until_ns) / 1e9
         self._feeding = Feeding(plan, recorded, indices, self._until_ns)
 
     def instants(self) -> Iterator[int]:

@@ -87,7 +87,7 @@ class Recorded:
         return int(missing[0]) if len(missing) else len(numbers)
 
 
-def last_ns(plan: Plan, until_ns: int) -> int:
+def last_instant_ns(plan: Plan, until_ns: int) -> int:
     """Returns the last instant of a plan's robots and nodes before `until_ns` [ns]."""
     tick_ns = gcd(*[one.period_ns for one in plan.formation])
     return (until_ns - 1) // tick_ns * tick_ns

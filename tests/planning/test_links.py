@@ -19,12 +19,15 @@ FILES = {
     "times.csv": "time,delay\n-1, 0.1\n0.5; 0.2\n2,lost\n",
     "headless.csv": "0,0.1\n1,0.2\n",
     "columns.csv": "seq, Delay\n7,0.1\n8,0.2\n",
+    "all_lost.txt": "lost\nlost\n",
     "negative.txt": "0.1\n-0.2\n",
     "words.txt": "# a\n0.1\nx y\n",
     "empty.txt": "\n# a\n",
     "head.txt": "delay\n",
     "back.csv": "time,delay\n0,0.1\n1,0.2\n1,0.1\n",
     "other.csv": "a,b\n0,1\n",
+    "no_time.csv": "time,delay\n0,0.1\nlost,0.2\n",
+    "late_time.csv": "0,0.1\n1e7,0.2\n",
     "infinite.txt": "0.1\ninf\n",
     "ragged.csv": "0,0.1\n0.2\n",
     "long.txt": "1e7\n",
@@ -57,6 +60,7 @@ def states(plan: Plan) -> LinkPlan:
     [
         ("{kind='trace',file='good.txt'}", DelayTrace((10_000_000, LOST, 20_500_000))),
         ("{kind='trace',file='columns.csv'}", DelayTrace((100_000_000, 200_000_000))),
+        ("{kind='trace',file='all_lost.txt'}", DelayTrace((LOST, LOST))),
         ("{kind='trace',file='headless.csv'}", DelayTrace((100_000_000, 200_000_000))),
         (
             "{kind='trace',file='times.csv',by='time'}",
@@ -68,7 +72,10 @@ def test_traces(folder: Path, delay: str, expected: DelayTrace) -> None:
     link = states(plan_of(folder, f"links=[{{channel='state',delay={delay}}}]"))
     assert link.delays == expected
     come = [each for each in expected.delays_ns if each != LOST]
-    assert (link.delay_min_ns, link.delay_max_ns, link.ideal, link.steady) == (min(come), max(come), False, False)
+    limits_ns = (min(come), max(come)) if come else (0, 0)
+    assert (link.delay_min_ns, link.delay_max_ns) == limits_ns
+    assert not link.ideal
+    assert not link.steady
 
 
 @pytest.mark.parametrize(
@@ -90,6 +97,11 @@ def test_traces(folder: Path, delay: str, expected: DelayTrace) -> None:
             "{file='back.csv',by='time'}",
             ".file = 'back.csv': line 4: time 1 must be later than that of the line before",
         ),
+        ("{file='no_time.csv',by='time'}", ".file = 'no_time.csv': line 3: 'lost' must be a number\n"),
+        (
+            "{file='late_time.csv',by='time'}",
+            ".file = 'late_time.csv': line 2: time 1e7 must be a number from -1e+06 to 1e+06",
+        ),
         ("{file='good.txt',by='time'}", ".file = 'good.txt': by = 'time' needs a column called time"),
         ("{file='none.txt'}", ".file: FOLDER/none.txt: No such file or directory"),
         ("{file='.'}", ".file: FOLDER: Is a directory"),
@@ -104,7 +116,7 @@ def test_mistakes_in_traces_name_their_line(folder: Path, delay: str, line: str)
     with pytest.raises(ScenarioError) as caught:
         plan_of(folder, f"links=[{{delay={delay}}}]")
     (said,) = caught.value.lines
-    assert f": links.0.delay{line.replace('FOLDER', str(folder))}" in said
+    assert f": links.0.delay{line.replace('FOLDER', str(folder))}" in f"{said}\n"  # a line break stands for the end
 
 
 @pytest.mark.parametrize(

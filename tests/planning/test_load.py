@@ -374,6 +374,12 @@ def test_a_missing_key_of_a_robot_is_reported_with_all_other_mistakes(given, oth
     )
 
 
+def test_robots_without_a_start_do_not_start_in_one_place():
+    nowhere = BASE.replace("start = [0.0, 0.0]", "").replace("start = [1.0, 0.0]", "")
+    missing = "missing (neither here, nor in its group, nor in [robot]); the same holds for 1 more"
+    assert lines(nowhere) == [f"t.toml: formation.robots.a.start: {missing}"]
+
+
 @pytest.mark.parametrize("given", NEEDED[:-1])
 @pytest.mark.parametrize("table", ["robot", "formation.robot", "formation.robots.a"])
 def test_a_key_of_a_robot_may_stand_on_any_level(given, table):

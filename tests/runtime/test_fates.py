@@ -245,10 +245,10 @@ def test_lengths_of_bursts_and_of_the_times_between_are_geometric(name: str, bad
     assert stats.chisquare(seen, lengths.size * share).pvalue > 0.01
 
 
-@pytest.mark.parametrize("name", BURSTS)
-def test_bursts_are_the_plain_chain_of_two_states(name: str) -> None:
+@pytest.mark.parametrize("name", [*BURSTS, "changes rarely"])
+def test_bursts_are_the_plain_chain_of_two_states_whatever_the_order_of_calls(name: str) -> None:
     """The chain as textbooks have it, one message after the other, from the same draws."""
-    bursts, blocks = BURSTS[name], 40
+    bursts, blocks = BURSTS.get(name, Bursts(1e-3, 2e-3, 0.0, 1.0)), 40
     made = fates(link(loss=0.5, bursts=bursts))
     chain = np.concatenate([draws(made.key, at, stream=2)[:, 0] for at in range(blocks)])
     state = bool(chain[0] < bursts.share_bad)
@@ -257,6 +257,11 @@ def test_bursts_are_the_plain_chain_of_two_states(name: str) -> None:
         state = bool(draw < (1 - bursts.to_good if state else bursts.to_bad))
         expected.append(state)
     assert np.concatenate([made._bad(at, bursts) for at in range(blocks)]).tolist() == expected
+    in_turn = np.reshape(expected, (blocks, BLOCK))
+    for order in (range(0, blocks, 2), range(blocks - 1, -1, -1), np.random.default_rng(1).permutation(blocks)):
+        asked = fates(made.plan)
+        for at in map(int, order):
+            assert np.array_equal(asked._bad(at, bursts), in_turn[at])
 
 
 delays = st.sampled_from(
@@ -345,6 +350,7 @@ def test_what_is_sent_in_a_blackout_is_lost() -> None:
     lost = [instant for instant in sent if not made.of(instant, instant)]
     assert lost == [*range(10, 20), 30]
     assert merged([(30, 31), (15, 20), (10, 16)]) == ((10, 20), (30, 31))
+    assert merged([(2, 3), (5, 9), (0, 2), (6, 7)]) == ((0, 3), (5, 9))
 
 
 def test_a_trace_is_replayed_line_by_line_or_by_time() -> None:

@@ -88,7 +88,7 @@ def test_on_a_wall_clock_a_state_may_lack(tmp_path: Path) -> None:
 
 def test_numbers_beyond_those_of_the_format_come_back(tmp_path: Path) -> None:
     plan = plan_of("lab")
-    numbers = [(1 << 32) - 2, (1 << 32) - 1, 1 << 32, (1 << 32) + 1]
+    numbers = [(1 << 32) - 2, (1 << 32) - 1, 1 << 32, (1 << 32) + 1, 1 << 33, (1 << 33) + 1]
     with closing(Recorder(tmp_path / "run.mcap", plan, "", {})) as recorder:
         for number in numbers:
             recorder.record(Message(Channel.STATE, 0, number, number * 10_000_000, np.ones(16)))
@@ -116,6 +116,12 @@ def of_nobody(path: Path) -> None:
         recorder.record(Message(Channel.COMMAND, 30, 0, 0, NULL))
 
 
+def of_no_channel(path: Path) -> None:
+    """Records a null message on a channel that does not exist."""
+    with closing(Recorder(path, plan_of("lab"), "", {})) as recorder:
+        recorder.record(Message(17, 0, 0, 0, NULL))  # type: ignore[arg-type]
+
+
 def empty(path: Path) -> None:
     """Records nothing."""
     Recorder(path, plan_of("lab"), "", {}).close()
@@ -127,6 +133,7 @@ def empty(path: Path) -> None:
         (twice, r"/run.mcap: /g1/r1/state has two messages number 0"),
         (of_another_plan, r"/run.mcap: a message of /g1/state has \d+ bytes, not \d+"),
         (of_nobody, r"/run.mcap: /nulls names source 30 and channel 4, which are not of this plan"),
+        (of_no_channel, r"/run.mcap: /nulls names source 0 and channel 17, which are not of this plan"),
         (empty, r"/run.mcap: holds no messages between roles of this plan"),
         (lambda path: path.write_bytes(b"hello"), r"/run.mcap: is no MCAP file"),
     ],

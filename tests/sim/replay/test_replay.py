@@ -233,6 +233,19 @@ def test_on_a_wall_clock_it_says_what_is_exact(tmp_path: Path) -> None:
     assert "on a wall clock: when each message arrived is not recorded" in str(found)
 
 
+def test_on_a_wall_clock_a_recording_is_whole_up_to_its_last_message(tmp_path: Path) -> None:
+    folder = record(
+        tmp_path / "run",
+        "lab",
+        alter=lambda message: None if message.time_ns > 200_000_000 else message,
+        metadata={"engine": "processes", "clock": "wall"},
+    )
+    found = replayed(folder, only=("g1",))
+    assert found.until == 0.2
+    assert channel_of(found, "g1", Channel.COMMAND).compared == 21
+    assert "it is whole up to t = 0.2 s of 0.4 s" in str(found)
+
+
 def test_a_recording_by_another_version_is_told(tmp_path: Path) -> None:
     metadata = {"engine": "inprocess", "clock": "virtual", "echelon": "0.0.1", "numpy": "1.0"}
     text = str(replayed(record(tmp_path / "run", "lab", metadata=metadata)))

@@ -36,9 +36,15 @@ def fused(function: Callable[P, R]) -> Callable[P, R]:
 def _compiled(function: Callable[P, R], fused: bool) -> Callable[P, R]:
     _compiler.config.CACHE_DIR, before = str(cache_folder()), _compiler.config.CACHE_DIR
     try:
-        # Nothing is allocated, so nothing needs counts of references (_nrt).
+        # Nothing is allocated, so nothing needs counts of references (_nrt).  A call passes seven numbers for each array, often
+        # more than the function itself has to do: all become one function.
         marked: Callable[P, R] = _compiler.njit(
-            cache=True, nogil=True, error_model="numpy", fastmath={"contract"} if fused else False, _nrt=False
+            cache=True,
+            nogil=True,
+            error_model="numpy",
+            fastmath={"contract"} if fused else False,
+            forceinline=True,
+            _nrt=False,
         )(function)
         return marked
     finally:

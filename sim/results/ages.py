@@ -2,10 +2,9 @@
 
 With `law.reference = "now"` a node compares states of t - τ with the reference of t.  If the formation moves with the velocity
 v, the measured position is wrong by -v τ, and the law makes up for this: the formation stands v τ ahead of its reference.
-This is a steady error, not an
-instability (docs/architecture.md, 2.10).  If a node's children have different ages, the shape is wrong, too: with the mean ages
-τ = (τ_1, τ_2, …) of the states of its children, its shape variable z is off by v (Φ_node τ)_z, and the centroid of the
-formation by v times the weighted mean of the root's τ.
+This is a steady error, not an instability (docs/architecture.md, 2.10).  If a node's children have different ages, the shape is
+wrong, too: with the mean ages τ = (τ_1, τ_2, …) of the states of its children, its shape variable z is off by v (Φ_node τ)_z,
+and the centroid of the formation by v times the weighted mean of the root's τ.
 """
 
 from collections.abc import Mapping, Sequence

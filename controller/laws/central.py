@@ -16,12 +16,11 @@ class CentralLaw:
     A law with a state integrates at every call.  So it must be called once per period, and all nodes must have the same
     period; `reset` sets the states to zero again."""
 
-    def __init__(self, plan: Plan, lead: float | None = None) -> None:
-        """Takes the law of a plan; `lead` [periods] replaces that of the plan."""
+    def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.transformation = Transformation(plan)
         self.trajectory = make_trajectory(plan.trajectory)
-        self._blocks = [law_block(plan, block, lead) for block in plan.blocks]
+        self._blocks = [law_block(plan, block) for block in plan.blocks]
         self._nu = [make_nu(plan.law, block) for block in self._blocks]
         self._weights = [make_weight(plan.law, block) for block in self._blocks]
         robots = len(plan.robots)

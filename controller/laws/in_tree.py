@@ -29,12 +29,12 @@ class BlockGains:
     """W/σ, the gain of F_pot [1/s], (size, size)"""
 
     @classmethod
-    def of(cls, plan: Plan, block: BlockPlan, lead: float | None = None) -> "BlockGains":
-        """Returns the matrices of a block of a plan; `lead` [periods] replaces that of the plan.
+    def of(cls, plan: Plan, block: BlockPlan) -> "BlockGains":
+        """Returns the matrices of a block of a plan.
 
         Raises PartRunError if the law's W is wrong."""
         rows = slice(block.offset, block.offset + block.size)
-        seen = law_block(plan, block, lead)
+        seen = law_block(plan, block)
         if is_linear(plan):
             gains = plan.law.made.linear(seen)
             K_1, K_2, weight = gains.K_1, gains.K_2, gains.weight

@@ -136,7 +136,7 @@ no longer settles.  It assumes that robots follow the desired accelerations exac
 a torque loop that is too slow for that.  It refuses links that lose messages or whose delays
 vary, and laws that are not linear: run such scenarios instead.""",
     examples={
-        "echelon analyse paper": "states may be up to 6 ms late",
+        "echelon analyse paper": "states may be up to 6.8 ms late",
         "echelon analyse lab --set 'links=[{channel=\"state\",delay=0.3}]'": "with a delay",
         "echelon analyse lab --json": "for scripts",
     },

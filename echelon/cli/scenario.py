@@ -216,7 +216,7 @@ Checks a scenario.  Prints what it means: robots, duration, time scales, whether
 its CAN buses.  Or prints all its mistakes, one line each: key, value, and what is allowed.
 Prints warnings, one line each, about what is allowed but probably not intended: time scales
 near the period, more torque or speed than the robots have, claims about times after the end,
-delays that are rounded up to whole periods.""",
+delays that time-driven members round up to whole periods.""",
         examples={
             "echelon validate lab": "a shipped scenario",
             "echelon validate my.toml --set law.lead=0.5": "a file with one value changed",

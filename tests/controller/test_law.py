@@ -94,9 +94,9 @@ def test_all_ones_couplings_of_the_paper():
     assert [block.sigma for block in plan.blocks] == pytest.approx([0.01, 0.01, 0.01, 0.1, 1.0])
 
 
-def slope(plan: Plan, lead: float | None = None) -> Array:
+def slope(plan: Plan) -> Array:
     """Returns the matrix A of d(e, ė)/dt = A (e, ė) for Z̈ = ν, from the law's answers to unit errors, (4N, 4N)."""
-    central = CentralLaw(plan, lead)
+    central = CentralLaw(plan)
     cbt, size = central.transformation, 2 * len(plan.robots)
     z_cd = central.trajectory.at(0.0)
     at_rest = cbt.backward(cbt.desired(z_cd[0]))
@@ -179,7 +179,7 @@ def test_lead_is_the_law_taken_at_the_error_to_come(seed, lead):
 def test_lead_zero_is_the_law_without_look_ahead():
     _, plan = paper_like(1, "multi")
     for block in plan.blocks:
-        gains = BlockGains.of(replace(plan, lead=0.5), block, lead=0.0)
+        gains = BlockGains.of(replace(plan, lead=0.0), block)
         np.testing.assert_allclose(gains.K_1, block.k1 / block.sigma**2, rtol=1e-14)
         np.testing.assert_allclose(gains.K_2, block.k2 / block.sigma, rtol=1e-14)
         np.testing.assert_array_equal(gains.K_coupling, plan.coupling[block.offset : block.offset + block.size])

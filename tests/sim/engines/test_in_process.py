@@ -1,6 +1,7 @@
 """Whole runs in one process, compared with continuous time, with the paper's claims, and with each other."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def continuous(plan: Plan, instants: Array) -> Array:
 
     The state of a robot is x, y, θ, v, ω.  p̈ = a means v̇ = e_v · a + d ω² and ω̇ = (e_n · a - v ω)/d
     (docs/architecture.md, 2.1)."""
-    central = CentralLaw(plan, lead=0.0)
+    central = CentralLaw(replace(plan, lead=0.0))
     d = np.array([robot.offset for robot in plan.robots])
     count = len(plan.robots)
 

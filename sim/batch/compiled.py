@@ -5,7 +5,7 @@ What is marked may call what is marked.  It allocates nothing: its scratch is an
 only.  So the same source can be compiled for other targets.
 
 Compiled code is kept in a folder for the sources it was made of, because numba looks only at the file of a function itself and
-not at the files of what that function calls.
+not at the files of what that function calls, or takes numbers from.
 """
 
 import hashlib
@@ -17,6 +17,10 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+
+from echelon.controller.laws import terminal_sliding
+from echelon.plan import delay_tables
+from echelon.runtime import fates
 
 _compiler: Any = numba  # without types: what there is of them changes from version to version
 P = ParamSpec("P")
@@ -52,8 +56,14 @@ def _compiled(function: Callable[P, R], fused: bool) -> Callable[P, R]:
 
 
 def is_kept() -> bool:
-    """True if the compiled code of these sources is kept, so that loading it takes less than a second."""
-    return any(cache_folder().rglob("whole_run.many_runs*.nbc"))
+    """True if the compiled code of these sources is kept, so that loading it takes less than a second, or if none is wanted."""
+    return _compiler.config.DISABLE_JIT or any(cache_folder().rglob("whole_run.many_runs*.nbc"))
+
+
+def sources() -> list[Path]:
+    """Returns the sources of the compiled code: this room, and modules whose numbers are compiled into it."""
+    modules = terminal_sliding, delay_tables, fates
+    return [*sorted(Path(__file__).parent.glob("*.py")), *(Path(module.__file__ or "") for module in modules)]
 
 
 @cache
@@ -61,7 +71,7 @@ def cache_folder() -> Path:
     """Returns the folder of the compiled code: below `$NUMBA_CACHE_DIR`, `$XDG_CACHE_HOME/echelon` or `~/.cache/echelon`, or
     below the folder for temporary files where that cannot be written."""
     digest = hashlib.blake2b(numba.__version__.encode(), digest_size=8)
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in sources():
         digest.update(source.read_bytes())
     user = os.environ.get("NUMBA_CACHE_DIR")
     base = Path(user) if user else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "echelon"

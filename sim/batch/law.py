@@ -61,7 +61,7 @@ def own_law(run: Any, block: Any, table: Any, index: Any, real: Any, e: int, rat
 
     `e`: place of the errors and their rates, rows (e_x, e_y, ė_x, ė_y).  `rates`: those of all blocks, or -1.  `force`: F_pot
     of the block, or -1."""
-    size = block.size
+    size = block.rows
     if run.law == SLIDING:
         for row in range(size):
             at = e + 2 * row - row % 2
@@ -98,7 +98,7 @@ def own_law(run: Any, block: Any, table: Any, index: Any, real: Any, e: int, rat
 @fused
 def _integrate(block: Any, table: Any, real: Any, e: int, eta: int) -> None:
     """Adds -K_i q to η, then integrates q."""
-    size, q, T = block.size, block.integral_at, block.period
+    size, q, T = block.rows, block.integral_at, block.period
     for row in range(size):
         if block.diagonal:
             real[eta + row] -= table[block.ki_at + row] * real[q + row]

@@ -74,13 +74,15 @@ class ModelMaker:
     def _stream(self, source: int, channel: Channel) -> dict[str, Any]:
         depth = self._depth(source, channel)
         if channel is Channel.STATE:
-            size = 4
+            length = 4
         else:
-            size = next(link.size or 0 for link in self.plan.links if (link.source, link.channel) == (source, channel))
+            length = next(
+                link.size or 0 for link in self.plan.links if (link.source, link.channel) == (source, channel)
+            )
         return {
-            "size": size,
+            "length": length,
             "mask": depth - 1,
-            "at": self.pools.real(depth * size),
+            "at": self.pools.real(depth * length),
             "marks_at": self.pools.whole(1 + 2 * depth),
         }
 
@@ -88,18 +90,16 @@ class ModelMaker:
         link, pools = self.plan.links[at], self.pools
         parts = self._parts(at)
         size = 0 if link.prompt else max(first + count for first, count in parts)
-        shift = (
-            parts[0][0] if len(parts) == 1 and size else 0
-        )  # of a long message that one part of is used, keep only that
+        shift = parts[0][0] if len(parts) == 1 and size else 0  # of one part only that part is kept
         record = {
-            "size": stream["size"],
+            "length": stream["length"],
             "mask": stream["mask"],
             "stream_at": stream["at"],
             "stream_marks_at": stream["marks_at"],
             "prompt": link.prompt,
             "timeout_ns": link.timeout_ns,
             "at": pools.real(size - shift) - shift,
-            "zeros_at": pools.real(stream["size"]) if link.policy == "zero" else -1,
+            "zeros_at": pools.real(stream["length"]) if link.policy == "zero" else -1,
             "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
         } | fates_of(link, pools)
         for number, (first, count) in enumerate(parts, start=1):
@@ -197,7 +197,7 @@ class ModelMaker:
         rows = [np.flatnonzero(row).tolist() for row in coupling]
         bounds = list(accumulate(map(len, rows), initial=0))
         return {
-            "size": block.size,
+            "rows": block.size,
             "diagonal": diagonal,
             "k1_at": places[0],
             "k2_at": places[1],

@@ -26,8 +26,11 @@ def gather(
             time_ns = heard_ns(links[index[node.links_at + child]], whole, time_ns, last_ns)
     whole[node.acted_at] = time_ns
     complete = 1
+    x = y = vx = vy = 0.0
+    is_known = False  # the reference at `time_ns`
     for child in range(count):
-        said = hear(links[index[node.links_at + child]], index, real, whole, time_ns)
+        link = links[index[node.links_at + child]]
+        said = hear(link, index, real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -38,7 +41,14 @@ def gather(
             for value in range(size):
                 real[node.state_at + here + value] = real[said + there + value]
         if run.of_message:
-            _bring(node, run, links, table, index, real, whole, child, time_ns)
+            age_ns = read_age_ns(link, time_ns, whole[link.marks_at + STAMP])
+            if age_ns == 0:
+                continue
+            if not is_known:
+                x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
+                is_known = True
+            then_x, then_y, then_vx, then_vy, _, _ = desired(run, table, max(0, time_ns - age_ns) * 1e-9)
+            _bring(node, run, index, real, child, x - then_x, y - then_y, vx - then_vx, vy - then_vy)
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -46,28 +56,20 @@ def gather(
         up = streams[node.up]
         if complete:
             place = room(up, whole)
-            for value in range(up.size):
+            for value in range(up.length):
                 real[place + value] = real[node.state_at + value]
         say(up, whole, time_ns, 1 - complete)
 
 
 @fused
-def _bring(
-    node: Any, run: Any, links: Any, table: Any, index: Any, real: Any, whole: Any, child: int, time_ns: int
-) -> None:  # fmt: skip
-    """Moves a child's state on as the reference has moved since the time of its message (controller.node)."""
-    link = links[index[node.links_at + child]]
-    age_ns = read_age_ns(link, time_ns, whole[link.marks_at + STAMP])
-    if age_ns == 0:
-        return
-    x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
-    then_x, then_y, then_vx, then_vy, _, _ = desired(run, table, max(0, time_ns - age_ns) * 1e-9)
-    x, y = x - then_x, y - then_y
+def _bring(node: Any, run: Any, index: Any, real: Any, child: int, x: float, y: float, vx: float, vy: float) -> None:
+    """Moves a child's state on as the reference has moved, by (x, y) and (vx, vy), since the time of its message
+    (controller.node)."""
     at = node.s_at + 4 * child
     real[at] += x
     real[at + 1] += y
-    real[at + 2] += vx - then_vx
-    real[at + 3] += vy - then_vy
+    real[at + 2] += vx
+    real[at + 3] += vy
     if not run.avoidance:
         return
     for part in range(index[node.carried_at + child], index[node.carried_at + child + 1]):

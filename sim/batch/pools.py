@@ -48,9 +48,9 @@ class Pools:
 
 
 def records_of(kind: np.dtype[np.void], rows: Sequence[dict[str, Any]]) -> NDArray[np.void]:
-    """Returns records of a kind with these values; what is not named is zero."""
+    """Returns records of a kind with these values, which are attributes too; what is not named is zero."""
     array = np.zeros(len(rows), dtype=kind)
     for at, row in enumerate(rows):
         for name, value in row.items():
             array[name][at] = value
-    return array
+    return array.view(np.recarray)

@@ -1,7 +1,8 @@
 """What a plan is as arrays: one record for the run, and one for each robot, node, block, stream and link.
 
 Matrices and lists of any length are in two pools: `table` of floats and `indices` of integers.  A field that ends in `_at` says
-where in a pool, or where in the scratch of a run, its part begins.  -1 means that there is none.
+where in a pool, or where in the scratch of a run, its part begins.  -1 means that there is none.  No field has the name of an
+attribute of numpy's scalars, such as `size`: uncompiled code would get that.
 
 The scratch of a run is two arrays: `real` of floats and `whole` of integers.
 """
@@ -53,20 +54,22 @@ NODE: Final = _record(
     "",
 )
 BLOCK: Final = _record(
-    # gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in `indices`, values in `table`
-    "size diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
+    # number of its rows; gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in
+    # `indices`, values in `table`
+    "rows diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
     "sigma ahead period bound",
 )
 STREAM: Final = _record(
-    # a role's messages on one channel: the last mask + 1 of them, of `size` values each from `at` in `real`; in `whole` their
+    # a role's messages on one channel: the last mask + 1 of them, of `length` values each from `at` in `real`; in `whole` their
     # number so far, then of each its stamp and whether it is null
-    "size mask at marks_at",
+    "length mask at marks_at",
     "",
 )
 LINK: Final = _record(
     # its stream, as above; `at`: the message in use in `real`, `zeros_at`: what is used where it is too old (policy `zero`);
     # places and sizes of the parts that the receiver uses of a message
-    "size mask stream_at stream_marks_at prompt timeout_ns at zeros_at marks_at first_1 size_1 first_2 size_2 first_3 size_3 "
+    "length mask stream_at stream_marks_at prompt timeout_ns at zeros_at marks_at "
+    "first_1 size_1 first_2 size_2 first_3 size_3 "
     # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
     "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
     "bursts loss_of_message fifo source_offset_ns receiver_offset_ns",

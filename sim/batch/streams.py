@@ -31,7 +31,7 @@ from echelon.sim.batch.records import (
 @compiled
 def room(stream: Any, whole: Any) -> int:
     """Returns where in `real` the values of the stream's next message belong."""
-    return int(stream.at + (whole[stream.marks_at] & stream.mask) * stream.size)
+    return int(stream.at + (whole[stream.marks_at] & stream.mask) * stream.length)
 
 
 @compiled
@@ -54,7 +54,7 @@ def hear(link: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
         whole[marks + TAKEN] = number + 1
         mark = link.stream_marks_at + 1 + 2 * (number & link.mask)
         whole[marks + STAMP], whole[marks + IS_NULL] = whole[mark], whole[mark + 1]
-        place = link.stream_at + (number & link.mask) * link.size
+        place = link.stream_at + (number & link.mask) * link.length
     else:
         take_up(link, index, whole)
         receive(link, whole, time_ns)
@@ -154,7 +154,7 @@ def _use(link: Any, real: Any, whole: Any) -> None:
     whole[marks + STAMP] = whole[mark]
     whole[marks + IS_NULL] = whole[mark + 1]
     if whole[mark + 1] == 0:
-        source = link.stream_at + (newest & link.mask) * link.size
+        source = link.stream_at + (newest & link.mask) * link.length
         _copy(real, source + link.first_1, link.at + link.first_1, link.size_1)
         _copy(real, source + link.first_2, link.at + link.first_2, link.size_2)
         _copy(real, source + link.first_3, link.at + link.first_3, link.size_3)

@@ -91,3 +91,11 @@ def test_of_one_instant_the_earliest_turn_is_first() -> None:
     early = differing("g1/r1", Channel.TORQUE, -1)
     assert earliest(PLAN, [*later_on, early]) == early.first_difference
     assert earliest(PLAN, []) is None
+    # States go up the tree, references down.
+    states, references = (
+        [differing(name, channel) for name in ("west/g1", "west", "coordinator")]
+        for channel in (Channel.GROUP_STATE, Channel.REFERENCE)
+    )
+    for rows in (states[:2], references[:0:-1]):
+        assert earliest(plan_of("three_levels"), rows) == rows[0].first_difference
+        assert earliest(plan_of("three_levels"), reversed(rows)) == rows[0].first_difference

@@ -6,7 +6,7 @@ import pytest
 
 from echelon.errors import UsageError
 from echelon.messages import NULL, Channel, Message
-from echelon.sim.recorded_runs import replay_run
+from echelon.sim.recorded_runs import open_recorded, replay_run
 from echelon.sim.replay.comparison import ChannelComparison
 from echelon.sim.replay.replay import Replay
 from support.recordings import LOSSY, QUICK, messages_of, planted, record
@@ -55,6 +55,16 @@ def test_without_a_change_all_outputs_are_equal(scenario: str, overrides: tuple[
     assert sum(channel.equal for channel in found.channels) == len(sent)
     if plan.can.closed:
         assert any(remark.startswith("bridge and drives are not replayed") for remark in found.remarks)
+
+
+def test_null_messages_take_the_place_of_older_messages_as_they_did_then(tmp_path: Path) -> None:
+    folder = record(
+        tmp_path / "run", "lab", "links=[{channel='state',loss=0.03,policy='hold_then_stop',timeout=0.015}]"
+    )
+    recorded = open_recorded(folder)
+    said, nulls = recorded.series[LEADER, Channel.COMMAND].sequences, recorded.nulls[LEADER, Channel.COMMAND]
+    assert set(said.tolist()) & {number - 1 for number in nulls}
+    assert replayed(folder).equal
 
 
 def test_a_changed_value_of_a_command_is_found_with_the_robot_that_heard_it(tmp_path: Path) -> None:

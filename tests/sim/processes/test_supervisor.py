@@ -10,6 +10,7 @@ from multiprocessing import Process
 from pathlib import Path
 from subprocess import Popen
 
+import numpy as np
 import pytest
 
 from echelon.messages import Channel
@@ -179,15 +180,24 @@ def test_two_runs_at_once_never_meet(tmp_path: Path) -> None:
     assert digests[0] != digests[1]
 
 
-def test_wall_clock_gives_the_same_when_nothing_is_late(tmp_path: Path) -> None:
+A_PERIOD_LATE = 'links=[{source="**", receiver="**", delay=0.05}]'
+
+
+def test_on_a_wall_clock_each_act_is_at_most_a_period_late_when_nothing_is_late(tmp_path: Path) -> None:
     plan = plan_of("lab", "duration=0.5", "periods.acceleration=0.05", "periods.torque=0.01")
     outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
     assert outcome.failure is None
     runners = [result.runner for result in outcome.processes if result.runner]
     assert len(runners) == 13
-    if not sum(runner.late for runner in runners):
-        assert outcome.trace.digest() == trace_of(plan).digest()
     assert outcome.wall_s >= 0.5
+    if not sum(runner.late for runner in runners):
+        # in virtual time, with each message a whole period on its way
+        slowest = plan_of("lab", "duration=0.5", "periods.acceleration=0.05", "periods.torque=0.01", A_PERIOD_LATE)
+        bound, difference = (
+            np.abs(trace.common()[1] - trace_of(plan).common()[1])[..., :2].max()
+            for trace in (trace_of(slowest), outcome.trace)
+        )
+        assert 0 < difference < bound
 
 
 def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:

@@ -42,7 +42,9 @@ CASES: dict[str, tuple[tuple[str, ...], str, str]] = {
         ("lab", "duration=6", "claims=[]", "formation.groups.g1.robots.r1.start=[0.3,1.2]", "avoidance.enabled=false"),
         "FAILS", "distance",
     ),
-    "limits act": (("lab", "duration=6", "claims=[]", "robot.torque_limit=0.05", "health.saturation=0.001"), "FAILS", "saturation"),
+    "limits act": (
+        ("lab", "duration=6", "claims=[]", "robot.torque_limit=0.05", "health.saturation=0.001"), "FAILS", "saturation",
+    ),
     "nothing arrives": (("lab", "duration=6", "claims=[]", 'links=[{channel="state", loss=1.0}]'), "FAILS", "messages"),
     "different periods": (
         ("three_levels", "duration=4", "claims=[]", "formation.period=0.04", "formation.groups.west.period=0.02"),

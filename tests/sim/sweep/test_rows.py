@@ -68,11 +68,13 @@ def test_the_batch_engine_gives_the_row_of_a_single_run(case: str) -> None:
         assert batch[name] == single[name], name
     lost = case == "is lost"  # its numbers are of any size
     for name in set(batch) - {"verdict", "reason"}:
-        if name.startswith(("decay_rate.", "age_p50.", "age_p95.")):
+        if name.startswith("decay_rate."):
             continue
         if name.startswith("growth.") and not min(single[name.replace("growth", "amplitude_before")]) > 1e-6:
             continue  # the ratio of two roundings
         found, expected = np.array(batch[name], dtype=float), np.array(single[name], dtype=float)
+        if name.startswith(("age_p50.", "age_p95.")) and np.isnan(found).all():
+            continue  # percentiles that the batch engine does not count
         assert (np.isnan(found) == np.isnan(expected)).all(), name
         if not lost:
             np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=name)

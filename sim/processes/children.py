@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
@@ -16,7 +16,9 @@ from types import ModuleType
 from typing import Any, Final
 
 from echelon.plan.plan import Plan, RobotPlan
+from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import loopback_endpoints
+from echelon.runtime.wire import data_key, run_keys, token_key, watch_key
 from echelon.sim.parts.foreign_parts import runs_text
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.process import main
@@ -30,6 +32,8 @@ LAST_WORDS: Final = 4000
 """How many bytes of a process's standard error are kept."""
 ROLES: Final = ("robot", "leader", "coordinator")
 """Kinds of processes that may run parts written by users"""
+NOBODY: Final = Credentials(Identity("", "", "", ()))
+"""Credentials before `introduced` has made them"""
 FINISHING: Final = ("bridge", "drives", "referee", "recorder")
 """Kinds of processes that get the order to finish, in this order.  Bridge and drives in lockstep do not need it: they are
 members and end with the run."""
@@ -207,6 +211,7 @@ def list_specs(
         "metadata": metadata,
         "part_files": part_files,
         "keep_going": keep_going,
+        "credentials": NOBODY,
     }
 
     def with_hubs(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
@@ -269,4 +274,38 @@ def list_specs(
             )
         )
     # the processes with the most imports start first
-    return sorted(specs, key=lambda spec: spec.kind not in FINISHING)
+    return sorted(introduced(specs), key=lambda spec: spec.kind not in FINISHING)
+
+
+def introduced(specs: Sequence[ProcessSpec]) -> list[ProcessSpec]:
+    """Returns the specifications with new credentials: each process knows those that it is connected to, and nobody else."""
+    own = [new_identity(f"{spec.kind}/{spec.name}", _own_keys(spec)) for spec in specs]
+    at = {endpoint: one for spec, one in zip(specs, own, strict=True) for endpoint in spec.listen}
+    guests: dict[str, list[Identity]] = {}
+    for spec, one in zip(specs, own, strict=True):
+        for endpoint in spec.connect:
+            guests.setdefault(endpoint, []).append(one)
+    return [
+        replace(
+            spec,
+            credentials=Credentials(
+                one,
+                run_keys(spec.run),
+                guests=tuple(guest for endpoint in spec.listen for guest in guests.get(endpoint, ())),
+                hosts=tuple(at[endpoint] for endpoint in spec.connect),
+            ),
+        )
+        for spec, one in zip(specs, own, strict=True)
+    ]
+
+
+def _own_keys(spec: ProcessSpec) -> list[str]:
+    """Returns the key expressions under which a process publishes."""
+    keys = [token_key(spec.run, spec.kind, spec.name, "*"), watch_key(spec.run, spec.kind, spec.name)]
+    roles = spec.plan.all_roles
+    if 0 <= spec.index < len(roles):
+        channels = {link.channel for link in spec.plan.links if link.source == spec.index}
+        keys += [data_key(spec.run, roles[spec.index].path, channel) for channel in sorted(channels)]
+    elif spec.kind == "bridge":
+        keys.append(watch_key(spec.run, "bridge", "frames"))
+    return keys

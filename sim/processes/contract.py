@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from echelon.plan.plan import Plan
+from echelon.runtime.credentials import Credentials
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
 from echelon.runtime.session import Session
@@ -49,6 +50,8 @@ class ProcessSpec:
     """Endpoints of other processes to which its session connects"""
     peers: tuple[tuple[str, str], ...]
     """(kind, name) of the processes whose tokens it waits for"""
+    credentials: Credentials
+    """Its secrets, and who the processes at these endpoints are"""
     watched: bool = True
     """True: its messages also go to watchers"""
     member: bool = True

@@ -90,6 +90,7 @@ def _open(spec: ProcessSpec) -> Session:
             connect=spec.connect,
             lockstep=spec.virtual,
             own_receiver=spec.kind == "bridge" and not spec.member,
+            credentials=spec.credentials,
         )
     except ValueError as error:
         raise StartError(str(error)) from None

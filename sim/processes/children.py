@@ -19,6 +19,7 @@ from echelon.plan.plan import Plan, RobotPlan
 from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import loopback_endpoints
 from echelon.runtime.wire import data_key, run_keys, token_key, watch_key
+from echelon.sim.observing import Gate
 from echelon.sim.parts.foreign_parts import runs_text
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.process import main
@@ -34,7 +35,7 @@ ROLES: Final = ("robot", "leader", "coordinator")
 """Kinds of processes that may run parts written by users"""
 NOBODY: Final = Credentials(Identity("", "", "", ()))
 """Credentials before `introduced` has made them"""
-FINISHING: Final = ("bridge", "drives", "referee", "recorder")
+FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
 """Kinds of processes that get the order to finish, in this order.  Bridge and drives in lockstep do not need it: they are
 members and end with the run."""
 
@@ -182,12 +183,14 @@ def list_specs(
     part_files: dict[str, str],
     recorded: bool,
     keep_going: bool,
+    gate: Gate | None = None,
 ) -> list[ProcessSpec]:
     """Returns the specifications of all processes of a run, with their connections.
 
     process        who connects to it
     node           its children
-    recorder       all other processes except the referee
+    recorder       all other processes except observers and referee
+    observers      the same, if the run is open to observers
     bridge         robots
     drives         robots and the bridge
 
@@ -196,11 +199,11 @@ def list_specs(
     stations = [role.name for role in plan.bus_roles]
     if can_urls and not plan.can.closed:
         stations = ["bridge"]
-    hubs = (["recorder"] if recorded else []) + stations
+    watchers = (["recorder"] if recorded else []) + (["observers"] if gate is not None else [])
+    hubs = watchers + stations
     endpoints = loopback_endpoints(len(plan.nodes) + len(hubs))
     at = {node.index: endpoints.pop() for node in plan.nodes}
     hub_at = {hub: endpoints.pop() for hub in hubs}
-    recorder = ["recorder"] if recorded else []
     common: dict[str, Any] = {
         "run": run,
         "plan": plan,
@@ -221,7 +224,7 @@ def list_specs(
     for member in plan.formation:
         near = [] if member.parent is None else [member.parent]
         near += [] if isinstance(member, RobotPlan) else member.children
-        endpoints_of, peers_of = with_hubs(recorder + (stations if isinstance(member, RobotPlan) else []))
+        endpoints_of, peers_of = with_hubs(watchers + (stations if isinstance(member, RobotPlan) else []))
         specs.append(
             ProcessSpec(
                 kind=member.role,
@@ -230,15 +233,15 @@ def list_specs(
                 listen=(at[member.index],) if member.index in at else (),
                 connect=(*(() if member.parent is None else (at[member.parent],)), *endpoints_of),
                 peers=(*((plan.formation[peer].role, plan.formation[peer].name) for peer in near), *peers_of),
-                watched=recorded or (bool(stations) and isinstance(member, RobotPlan) and not plan.can.closed),
+                watched=bool(watchers) or (bool(stations) and isinstance(member, RobotPlan) and not plan.can.closed),
                 **common,
             )
         )
     robots = tuple((robot.role, robot.name) for robot in plan.robots)
     for number, station in enumerate(stations):
         later = stations[number + 1 :]
-        endpoints_of, _ = with_hubs(recorder + later)
-        others = tuple((name, name) for name in recorder + stations if name != station)
+        endpoints_of, _ = with_hubs(watchers + later)
+        others = tuple((name, name) for name in watchers + stations if name != station)
         specs.append(
             ProcessSpec(
                 kind=station,
@@ -247,22 +250,23 @@ def list_specs(
                 listen=(hub_at[station],),
                 connect=endpoints_of,
                 peers=(*robots, *others),
-                watched=recorded,
+                watched=bool(watchers),
                 member=virtual and plan.can.closed,
                 **common,
             )
         )
-    if recorded:
+    for number, watcher in enumerate(watchers):
         everyone = tuple((member.role, member.name) for member in plan.formation)
         specs.append(
             ProcessSpec(
-                kind="recorder",
-                name="recorder",
-                index=len(plan.formation) + len(stations),
-                listen=(hub_at["recorder"],),
+                kind=watcher,
+                name=watcher,
+                index=len(plan.formation) + len(stations) + number,
+                listen=(hub_at[watcher],),
                 connect=(),
                 peers=(*everyone, *((name, name) for name in stations)),
                 member=False,
+                gate=gate if watcher == "observers" else None,
                 **common,
             )
         )

@@ -23,6 +23,7 @@ from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
 from echelon.runtime.session import Session
 from echelon.runtime.wire import SCHEMA_VERSION, token_key
+from echelon.sim.observing import Gate
 from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Ready, Report
 
@@ -37,7 +38,7 @@ class ProcessSpec:
     run: str
     """Name of the run, which no other run has"""
     kind: str
-    """`robot`, `leader`, `coordinator`, `recorder`, `bridge`, `drives` or `referee`"""
+    """`robot`, `leader`, `coordinator`, `recorder`, `observers`, `bridge`, `drives` or `referee`"""
     name: str
     index: int
     """Index of its role in the plan; for recorder, referee and the bridge of a mirrored path a number that is not used"""
@@ -52,6 +53,8 @@ class ProcessSpec:
     """(kind, name) of the processes whose tokens it waits for"""
     credentials: Credentials
     """Its secrets, and who the processes at these endpoints are"""
+    gate: Gate | None = None
+    """Where the process `observers` lets observers in"""
     watched: bool = True
     """True: its messages also go to watchers"""
     member: bool = True

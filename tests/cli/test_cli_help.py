@@ -25,7 +25,8 @@ LONG = (
     "echelon observe",
     "echelon completion bash",
 )
-"""Beginnings of the examples that take long, or need a run that goes on.  They are not run, nor are those with `vcan0`, which need that interface."""
+"""Beginnings of the examples that take long, or need a run that goes on.  They are not run, nor are those with `vcan0`, which
+need that interface."""
 QUICK = [example for example in EXAMPLES if not example.startswith(LONG) and "vcan0" not in example]
 
 

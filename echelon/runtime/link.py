@@ -136,7 +136,7 @@ class Link:
             elif (message := came.get(number)) is None:
                 complete = False
                 still_open.append((number, earliest_ns))
-            elif not self._depart(message):
+            elif self._depart(message) is None:
                 self._lost += 1
                 del came[number]
         self._open = still_open
@@ -153,12 +153,12 @@ class Link:
                 self._lost += 1
             self._sent += 1
 
-    def _depart(self, message: Message, received_ns: int | None = None) -> bool:
-        """Puts a message on its way; returns False if it is lost.  It arrives at `received_ns` at the earliest."""
+    def _depart(self, message: Message, received_ns: int | None = None) -> int | None:
+        """Puts a message on its way; returns when it arrives, `received_ns` at the earliest, or None if it is lost."""
         sent_ns = message.time_ns
         arrivals: Sequence[int] = [sent_ns + delay for delay in self._fates.of(message.sequence, sent_ns)]
         if not arrivals:
-            return False
+            return None
         if len(arrivals) > 1:
             arrivals = sorted(arrivals)
         if received_ns is not None:
@@ -169,7 +169,7 @@ class Link:
         heappush(self._flying, (arrivals[0], message.sequence))
         for arrival in arrivals[1:]:
             heappush(self._copies, arrival)
-        return True
+        return arrivals[0]
 
     def expected(self, time_ns: int) -> int:
         """Returns the number of the newest message that would have arrived by `time_ns` if all were sent when they are due."""
@@ -184,9 +184,9 @@ class Link:
             self._open = still_open
         return self._expected
 
-    def receive(self, message: Message, time_ns: int) -> bool:
-        """Takes a message that comes at `time_ns` of a wall clock: it arrives then, or after the delay of its link.  Returns
-        False if it is lost."""
+    def receive(self, message: Message, time_ns: int) -> int | None:
+        """Takes a message that comes at `time_ns` of a wall clock.  Returns when it arrives: then, or after the delay of its
+        link; None if it is lost."""
         return self._depart(message, time_ns)
 
     def newest(self, time_ns: int) -> int:
@@ -204,7 +204,14 @@ class Link:
 
     def next_arrival(self, than: int) -> int | None:
         """Returns the first instant at which a message arrives that is newer than number `than`, of those on their way."""
-        return min((arrives_ns for arrives_ns, number in self._flying if number > than), default=None)
+        flying = self._flying
+        if flying and flying[0][1] > than:
+            return flying[0][0]
+        return min((arrives_ns for arrives_ns, number in flying if number > than), default=None)
+
+    def arrival(self, sequence: int) -> int | None:
+        """Returns when message number `sequence` arrives, if it is on its way."""
+        return next((arrives_ns for arrives_ns, number in self._flying if number == sequence), None)
 
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
         """Counts a use at `time_ns` of message number `sequence`, which was sent at `sent_ns`."""

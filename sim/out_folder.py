@@ -26,6 +26,7 @@ from echelon.bridge.stations.closed import LOG
 from echelon.errors import UsageError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
+from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.shipped import EFFECTIVE
 from echelon.sim.run_state import STATE
 
@@ -43,7 +44,7 @@ def run_files(plan: Plan, bus: bool) -> tuple[str, ...]:
     """Returns the names of the files that a run may write, except for the files of users' parts.
 
     `bus` says whether the run makes CAN frames."""
-    return (EFFECTIVE, STATE, RECORDING, CUT, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
+    return (EFFECTIVE, STATE, RECORDING, CUT, ARRIVALS, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
 
 
 @dataclass(slots=True)

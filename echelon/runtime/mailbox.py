@@ -38,6 +38,7 @@ from echelon.plan.plan import LinkPlan, Plan
 from echelon.role import Acts, Input, Role, Stage
 from echelon.runtime.arrivals import pack_arrival
 from echelon.runtime.link import Link, LinkCounts
+from echelon.runtime.turns import deadline_ns
 
 MAX_AHEAD: Final = 32
 """Number of periods by which a role in a lockstep may be ahead of any of its sources.  On a link with delay or loss a role
@@ -229,9 +230,7 @@ class WallMailbox(Mailbox):
     def __init__(self, role: Role, plan: Plan, *, noted: bool = False) -> None:
         super().__init__(role, replace(plan, links=tuple(replace(link, punctual=False) for link in plan.links)))
         self._numbers = {
-            (link.channel, link.source): number
-            for number, link in enumerate(plan.links)
-            if link.receiver == role.index
+            (link.channel, link.source): number for number, link in enumerate(plan.links) if link.receiver == role.index
         }
         self.arrivals: bytearray | None = bytearray() if noted else None
         """Arrivals that are not in the file yet"""
@@ -250,15 +249,15 @@ class WallMailbox(Mailbox):
             self.arrivals += pack_arrival(number, message.sequence, message.time_ns, arrives_ns)
 
     def ready(self, stage: int, time_ns: int, deadline_ns: int) -> tuple[int, bool]:
-        """Returns the instant of whose messages a stage that is due at `time_ns` makes use if nothing further comes, and whether
-        it then misses a message.
+        """Returns up to which instant messages count for a stage that is due at `time_ns`, if nothing further comes, and whether
+        it then misses one.
 
         `deadline_ns` is the deadline of its turn, for a stage that acts in turn."""
         of, slots = self._stages[stage], self._stage_slots[stage]
+        expected = [slot.link.expected(time_ns) for slot in slots]
         if of.acts is Acts.IN_TURN:
             at_ns = time_ns
-            for slot in slots:
-                number = slot.link.expected(time_ns)
+            for slot, number in zip(slots, expected, strict=True):
                 if number > slot.in_use:
                     if number not in slot.newer:
                         return deadline_ns, True
@@ -270,6 +269,21 @@ class WallMailbox(Mailbox):
         for slot in slots:
             at_ns = min(max(at_ns, _heard_ns(slot, time_ns, at_ns, last_ns)), last_ns)
         return min(at_ns, last_ns), at_ns >= last_ns and self.misses(stage, time_ns)
+
+    def acts_with_all(self, stage: int, time_ns: int, deadline_ns: int) -> list[Act]:
+        """Returns the acts of a stage in its period from `time_ns` on, once all that arrives by `deadline_ns` has been
+        received."""
+        of = self._stages[stage]
+        ready_ns, _ = self.ready(stage, time_ns, deadline_ns)
+        acts = [(self.instant(stage, time_ns, ready_ns), self.hear(stage, ready_ns))]
+        if of.acts is Acts.ON_ARRIVAL and time_ns < self._end_ns:
+            while (at_ns := self.next_act(stage)) <= self.last_ns(stage, time_ns):
+                acts.append((at_ns, self.hear(stage, at_ns)))
+        return acts
+
+    def instant(self, stage: int, time_ns: int, ready_ns: int) -> int:
+        """Returns the instant at which a stage acts that is due at `time_ns`, and for which messages up to `ready_ns` count."""
+        return time_ns if self._stages[stage].acts in (Acts.IN_TURN, Acts.AT_INSTANT) else ready_ns
 
     def last_ns(self, stage: int, time_ns: int) -> int:
         """Returns the last instant at which a stage may act that is due at `time_ns`."""
@@ -288,6 +302,13 @@ class WallMailbox(Mailbox):
     def misses(self, stage: int, time_ns: int) -> bool:
         """Returns whether a message that is due at `time_ns` is neither in use nor here."""
         return any(slot.link.due(time_ns) > slot.in_use and not slot.newer for slot in self._stage_slots[stage])
+
+
+def allowed_ns(plan: Plan, stage: Stage) -> int:
+    """Returns how long after it is due a stage acts on a wall clock at the latest [ns]."""
+    if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT):
+        return deadline_ns(plan, stage.turn, stage.depth, stage.period_ns)
+    return stage.period_ns - 1
 
 
 def _heard_ns(slot: _Slot, time_ns: int, at_ns: int, last_ns: int) -> int:

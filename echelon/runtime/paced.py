@@ -15,10 +15,9 @@ from echelon.messages import Message
 from echelon.plan.plan import Plan
 from echelon.role import Acts, Role, Stage
 from echelon.runtime.arrivals import END, FLUSH_NS, ArrivalFile, pack_arrival
-from echelon.runtime.mailbox import WallMailbox
+from echelon.runtime.mailbox import WallMailbox, allowed_ns
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
-from echelon.runtime.turns import deadline_ns
 
 
 class PacedRunner(Runner):
@@ -40,12 +39,7 @@ class PacedRunner(Runner):
         self._started = False
         self._start_ns = 0  # run time 0 in `time.monotonic_ns`
         self._has_acted = False  # the stage at `_at` has acted, and acts again when something arrives
-        self._allowed_ns = [
-            deadline_ns(plan, stage.turn, stage.depth, stage.period_ns)
-            if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT)
-            else stage.period_ns - 1
-            for stage in role.stages
-        ]
+        self._allowed_ns = [allowed_ns(plan, stage) for stage in role.stages]
         """For each stage how long after it is due it acts at the latest [ns]"""
         super().__init__(role, plan, session, run, self._inbox, watched=watched, batch_bytes=0)
 
@@ -106,7 +100,7 @@ class PacedRunner(Runner):
 
     def _act(self, number: int, stage: Stage, ready_ns: int) -> None:
         """Lets a stage act with what it hears at `ready_ns`."""
-        at_ns = ready_ns if stage.acts in (Acts.WHEN_HEARD, Acts.ON_ARRIVAL) else self._time_ns
+        at_ns = self._inbox.instant(number, self._time_ns, ready_ns)
         for message in stage.run(at_ns, self._inbox.hear(number, ready_ns)):
             self._send(message)
 
@@ -138,8 +132,8 @@ class PacedRunner(Runner):
             return
         self._written_ns = now_ns
         with self._lock:
-            records, self._inbox.arrivals = self._inbox.arrivals, bytearray()
-        self._arrivals.write(records or b"")
+            records, self._inbox.arrivals = bytes(self._inbox.arrivals or b""), bytearray()
+        self._arrivals.write(records)
 
     def finish(self) -> None:
         super().finish()

@@ -128,9 +128,8 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
     if spec.virtual:
         runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched)
     else:
-        runner = PacedRunner(
-            role, spec.plan, session, spec.run, watched=spec.watched, arrivals=ArrivalFile(Path(spec.folder))
-        )
+        arrivals = ArrivalFile(Path(spec.folder)) if spec.recorded else None
+        runner = PacedRunner(role, spec.plan, session, spec.run, watched=spec.watched, arrivals=arrivals)
     role.counts = runner.mailbox.counts
     start_ns = meet(spec, session, control)
     signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())

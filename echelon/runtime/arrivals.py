@@ -4,9 +4,10 @@ All members of a run append to one file.  It is a sequence of records of 24 byte
 
     number of the link in the plan u32 | number of the message u32 | sent [ns] i64 | arrived [ns] i64
 
-Both instants are run time: the time in the message's header, and the instant from which on its receiver uses it.  A member that
-ends in order writes a last record with the link `END`, its index in the place of the message's number, and the end of its run
-in the place of both instants.
+Both instants are run time: the time in the message's header, and the instant from which on its receiver uses it.  A second
+record of the same message corrects that instant: the receiver acted late, and the message counted earlier.  A member that ends
+in order writes a last record with the link `END`, its index in the place of the message's number, and the end of its run in the
+place of both instants.
 """
 
 import os

@@ -14,7 +14,7 @@ instant on, and nothing is drawn.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from typing import Final
 
 from echelon.messages import Channel, Message
@@ -63,6 +63,7 @@ class Link:
         "_copies",
         "_delivered",
         "_duplicates",
+        "_earliest",
         "_expected",
         "_fates",
         "_first_ns",
@@ -93,6 +94,8 @@ class Link:
         """Messages on their way, as a heap: instant of arrival and number"""
         self._copies: list[int] = []
         """Arrivals of second copies, as a heap"""
+        self._earliest: dict[int, int] = {}
+        """On a wall clock, when messages of `_flying` would arrive by the rule of the link, by number, where they came later"""
         self._age_sum = self._age_max = self._aged = 0
         self._ages = AgeCounts()
 
@@ -162,6 +165,8 @@ class Link:
         if len(arrivals) > 1:
             arrivals = sorted(arrivals)
         if received_ns is not None:
+            if arrivals[0] < received_ns:
+                self._earliest[message.sequence] = arrivals[0]
             arrivals = [max(received_ns, arrival) for arrival in arrivals]
         if self.plan.fifo:
             arrivals = [max(self._latest_ns, arrival) for arrival in arrivals]
@@ -194,6 +199,7 @@ class Link:
         flying, copies = self._flying, self._copies
         while flying and flying[0][0] <= time_ns:
             _, sequence = heappop(flying)
+            self._earliest.pop(sequence, None)
             self._delivered += 1
             if sequence > self.latest:
                 self.latest = sequence
@@ -208,6 +214,22 @@ class Link:
         if flying and flying[0][1] > than:
             return flying[0][0]
         return min((arrives_ns for arrives_ns, number in flying if number > than), default=None)
+
+    def hasten(self, time_ns: int) -> list[int]:
+        """Lets messages that have come after `time_ns` of a wall clock arrive then, if they were sent by then and the rule of
+        the link allows it; returns their numbers."""
+        flying, earliest = self._flying, self._earliest
+        if not earliest:
+            return []
+        hastened = [
+            number
+            for arrives_ns, number in flying
+            if arrives_ns > time_ns and earliest.get(number, arrives_ns) <= time_ns
+        ]
+        if hastened:
+            flying[:] = [(time_ns if number in hastened else arrives_ns, number) for arrives_ns, number in flying]
+            heapify(flying)
+        return hastened
 
     def arrival(self, sequence: int) -> int | None:
         """Returns when message number `sequence` arrives, if it is on its way."""

@@ -223,9 +223,11 @@ class WallMailbox(Mailbox):
     """All inputs of one role on a wall clock.  Instants are run time, and a message arrives when it really comes, or later if
     the scenario gives its link a delay.
 
-    What a stage hears, and when it acts in run time, depends on the instants of arrival alone, not on when the process gets to
-    it.  So a run on a wall clock is the run in virtual time whose messages take as long (docs/architecture.md, 4.6).  With
-    `noted`, the arrivals are kept for a file (echelon.runtime.arrivals)."""
+    When a stage acts in run time depends on the instants of arrival alone, not on when the process gets to it.  If that is
+    later, messages that have come until then, and had been sent by the instant of the act, count as having arrived in that
+    instant (`hasten`).  So a run on a wall clock is the run in virtual time whose messages take as long (docs/architecture.md,
+    4.6).
+    With `noted`, the arrivals are kept for a file (echelon.runtime.arrivals)."""
 
     def __init__(self, role: Role, plan: Plan, *, noted: bool = False) -> None:
         super().__init__(role, replace(plan, links=tuple(replace(link, punctual=False) for link in plan.links)))
@@ -244,12 +246,21 @@ class WallMailbox(Mailbox):
         if arrives_ns is None:
             return
         slot.newer[message.sequence] = message
+        self._note(message, arrives_ns)
+
+    def _note(self, message: Message, arrives_ns: int) -> None:
         if self.arrivals is not None:
             number = self._numbers[message.channel, message.source]
             self.arrivals += pack_arrival(number, message.sequence, message.time_ns, arrives_ns)
 
+    def hasten(self, stage: int, time_ns: int) -> None:
+        """Lets the messages that have come for a stage count from `time_ns` on, if they had been sent by then."""
+        for slot in self._stage_slots[stage]:
+            for number in slot.link.hasten(time_ns):
+                self._note(slot.newer[number], time_ns)
+
     def ready(self, stage: int, time_ns: int, deadline_ns: int) -> tuple[int, bool]:
-        """Returns up to which instant messages count for a stage that is due at `time_ns`, if nothing further comes, and whether
+        """Returns up to which instant messages count for a stage that is due at `time_ns` if nothing further comes, and whether
         it then misses one.
 
         `deadline_ns` is the deadline of its turn, for a stage that acts in turn."""

@@ -5,8 +5,7 @@ deadline.  A stage whose deadline has come runs with the newest messages that ha
 missing (`echelon.runtime.mailbox.WallMailbox`).
 
 In run time a stage acts in the instant in which the message arrives that completes its inputs, or at its deadline, even if the
-process gets to it later.  So what it takes to compute is part of the time that its messages take, and nothing else depends on
-the speed of the machine.
+process gets to it later.  So what it takes to compute is part of the time that its messages take.
 """
 
 import time
@@ -83,6 +82,7 @@ class PacedRunner(Runner):
                     counts.stages += 1
                     if stage.inputs:
                         counts.latest_ns = max(counts.latest_ns, now_ns - deadline_ns)
+                    mailbox.hasten(number, ready_ns)
                     self._act(number, stage, ready_ns)
                 if stage.acts is Acts.ON_ARRIVAL and due_ns < self.plan.duration_ns:
                     self._has_acted = True
@@ -99,7 +99,7 @@ class PacedRunner(Runner):
         return start_ns + self._time_ns
 
     def _act(self, number: int, stage: Stage, ready_ns: int) -> None:
-        """Lets a stage act with what it hears at `ready_ns`."""
+        """Lets a stage act with what it hears at `ready_ns`, even if that is over."""
         at_ns = self._inbox.instant(number, self._time_ns, ready_ns)
         for message in stage.run(at_ns, self._inbox.hear(number, ready_ns)):
             self._send(message)

@@ -24,7 +24,9 @@ def read_arrivals(path: Path, plan: Plan) -> Arrivals:
     is_end = records["link"] == END
     ends_ns = {int(one["number"]): int(one["arrived"]) for one in records[is_end]}
     arrivals = records[~is_end]
-    arrivals = arrivals[np.lexsort((arrivals["arrived"], arrivals["number"], arrivals["link"]))]
+    arrivals = arrivals[
+        np.lexsort((arrivals["number"], arrivals["link"]))
+    ]  # stable: records of a message stay in order
     bounds = np.searchsorted(arrivals["link"], np.arange(len(plan.links) + 1))
     links = {
         number: _of_link(arrivals[bounds[number] : bounds[number + 1]])
@@ -35,11 +37,12 @@ def read_arrivals(path: Path, plan: Plan) -> Arrivals:
 
 
 def _of_link(records: NDArray[np.void]) -> LinkArrivals:
-    """Returns the arrivals of a link: of each message the first.  `records` are in the order of numbers, then arrivals."""
-    first = np.ones(len(records), bool)
-    first[1:] = records["number"][1:] != records["number"][:-1]
-    columns = [records[name][first].astype(np.int64) for name in ("number", "sent", "arrived")]
-    return LinkArrivals(*columns)
+    """Returns the arrivals of a link.  Its records are in the order of numbers; of each message the first record has the
+    arrival, the last one the instant from which on it counted."""
+    differs = records["number"][1:] != records["number"][:-1]
+    first, last = np.append(True, differs)[: len(records)], np.append(differs, True)[-len(records) :]
+    numbers, sent_ns, arrived_ns = (records[name][first].astype(np.int64) for name in ("number", "sent", "arrived"))
+    return LinkArrivals(numbers, sent_ns, arrived_ns, records["arrived"][last].astype(np.int64))
 
 
 def _fit(records: NDArray[np.void], plan: Plan) -> NDArray[np.bool_]:

@@ -149,7 +149,7 @@ def _arriving(recorded: Recorded, arrivals: Arrivals, index: int) -> Iterator[tu
     for number, one in arrivals.links.items():
         link = recorded.plan.links[number]
         if link.receiver == index:
-            for message_number, arrived_ns in zip(one.numbers.tolist(), one.arrived_ns.tolist(), strict=True):
+            for message_number, arrived_ns in zip(one.numbers.tolist(), one.counted_ns.tolist(), strict=True):
                 message = recorded.message(link.source, link.channel, message_number)
                 if message is not None:
                     yield arrived_ns, message

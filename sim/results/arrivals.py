@@ -22,6 +22,8 @@ class LinkArrivals:
     """Instants of sending, as the messages' headers have them [ns], (n,)"""
     arrived_ns: Whole
     """Instants of arrival [ns], (n,); not before those of sending"""
+    counted_ns: Whole
+    """Instants from which on the receiver counted them as arrived [ns], (n,): earlier where it was late itself"""
 
     @property
     def latencies_ns(self) -> Whole:
@@ -48,9 +50,9 @@ class Arrivals:
         if member in self.ends_ns:
             return self.plan.duration_ns + 1
         last = [
-            int(one.arrived_ns.max())
+            int(one.counted_ns.max())
             for number, one in self.links.items()
-            if self.plan.links[number].receiver == member and len(one.arrived_ns)
+            if self.plan.links[number].receiver == member and len(one.counted_ns)
         ]
         return max(last, default=-1)
 
@@ -69,11 +71,12 @@ class Arrivals:
         return max(numbers, default=0)
 
     def trace(self, number: int) -> DelayTrace:
-        """Returns the delays of a link, by number: of all messages that are due in the run, lost where none arrived."""
+        """Returns the delays with which a link in virtual time does the same, by number: of all messages that are due in the
+        run; lost where none arrived."""
         link, one = self.plan.links[number], self.links[number]
         delays = np.full(due_in(self.plan, link), LOST, np.int64)
         inside = one.numbers < len(delays)
-        delays[one.numbers[inside]] = one.latencies_ns[inside]
+        delays[one.numbers[inside]] = (one.counted_ns - one.sent_ns)[inside]
         return DelayTrace(tuple(delays.tolist()))
 
 

@@ -88,7 +88,7 @@ class Recorded:
             link = self.plan.links[number]
             if link.receiver == member:
                 missing = ~np.isin(one.numbers, self._numbers((link.source, link.channel)))
-                until_ns = min(until_ns, int(one.arrived_ns[missing].min(initial=until_ns)))
+                until_ns = min(until_ns, int(one.counted_ns[missing].min(initial=until_ns)))
         return until_ns
 
     def whole_until_ns(self) -> int:

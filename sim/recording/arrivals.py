@@ -39,10 +39,9 @@ def read_arrivals(path: Path, plan: Plan) -> Arrivals:
 def _of_link(records: NDArray[np.void]) -> LinkArrivals:
     """Returns the arrivals of a link.  Its records are in the order of numbers; of each message the first record has the
     arrival, the last one the instant from which on it counted."""
-    differs = records["number"][1:] != records["number"][:-1]
-    first, last = np.append(True, differs)[: len(records)], np.append(differs, True)[-len(records) :]
-    numbers, sent_ns, arrived_ns = (records[name][first].astype(np.int64) for name in ("number", "sent", "arrived"))
-    return LinkArrivals(numbers, sent_ns, arrived_ns, records["arrived"][last].astype(np.int64))
+    numbers, sent_ns, arrived_ns = (records[name].astype(np.int64) for name in ("number", "sent", "arrived"))
+    first, last = np.diff(numbers, prepend=-1) != 0, np.diff(numbers, append=-1) != 0
+    return LinkArrivals(numbers[first], sent_ns[first], arrived_ns[first], arrived_ns[last])
 
 
 def _fit(records: NDArray[np.void], plan: Plan) -> NDArray[np.bool_]:

@@ -64,7 +64,8 @@ def write_traces(run: Path, arrivals: Arrivals, out: Path, *, replace: bool = Fa
     traces = {number: trace_name(plan, link) for number, link in _can_have_rules(plan, arrivals)}
     texts = {name: trace_text(plan, arrivals, number) for number, name in traces.items()}
     out.mkdir(parents=True, exist_ok=True)
-    kept = keep_parts(scenario, out, (EFFECTIVE, *texts))
+    without_links = scenario.model_copy(update={"links": []})
+    kept = keep_parts(scenario if plan.can.closed else without_links, out, (EFFECTIVE, *texts))
     table = _with_traces(scenario, plan, traces, kept.names)
     texts = {EFFECTIVE: tomlkit.dumps(table), **texts}
     for name, text in texts.items():

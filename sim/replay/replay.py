@@ -190,7 +190,7 @@ class Replaying:
         short = {index: end_ns for index, end_ns in self._heard_until_ns.items() if end_ns < until_ns}
         if short:
             index, end_ns = min(short.items(), key=lambda each: each[1])
-            others = f", and of {len(short) - 1} more up to later instants" if len(short) > 1 else ""
+            others = f", and of {len(short) - 1} more not to the end either" if len(short) > 1 else ""
             yield (
                 f"not all that roles heard is known: of {self._plan.formation[index].name} outputs are compared up to "
                 f"t = {max(end_ns, 0) / 1e9:.9g} s{others}"

@@ -143,7 +143,7 @@ def test_of_a_wall_clock_the_outputs_are_compared_as_far_as_arrivals_are_known(r
     done = echelon("replay", folder)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert "not all that roles heard is known: of " in done.stdout
-    assert "and of 12 more up to later instants" in done.stdout
+    assert "and of 12 more not to the end either" in done.stdout
     damaged = bytearray(data)
     damaged[len(data) // 48 * 24] ^= 0xFF
     (folder / "arrivals.bin").write_bytes(damaged)

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import tomlkit
 
@@ -24,9 +24,6 @@ from echelon.sim.recording.arrivals import read_arrivals
 from echelon.sim.recording.mcap_reader import read_metadata
 from echelon.sim.results.arrivals import Arrivals
 from echelon.sim.results.latencies import Latencies
-
-TRACES: Final = "latencies"
-"""Name of the folder in a run's folder for the files that are made from its latencies"""
 
 
 def measured(folder: Path) -> Latencies:

@@ -38,6 +38,8 @@ SUMMARY: Final = "summary.json"
 REPORT: Final = "report.html"
 TABLES: Final = ("csv", "parquet")
 """Folders of exported tables"""
+TRACES: Final = "latencies"
+"""Folder of the traces that are made from a run's latencies (echelon.sim.measured_links)"""
 
 
 def run_files(plan: Plan, bus: bool) -> tuple[str, ...]:
@@ -172,7 +174,7 @@ def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
 
 def _misleading(path: Path) -> Iterator[str]:
     """Yields the names in a folder that look like files of a run.  Called when those of earlier runs are deleted already."""
-    stems = {name.partition(".")[0] for name in (RECORDING, SUMMARY, REPORT, LOG)} | {"torque", *TABLES}
+    stems = {name.partition(".")[0] for name in (RECORDING, SUMMARY, REPORT, LOG)} | {"torque", TRACES, *TABLES}
     for entry in sorted(path.iterdir()):
         if entry.name.partition(".")[0].partition("-")[0] in stems:
             yield entry.name

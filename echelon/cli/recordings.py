@@ -77,7 +77,8 @@ class LatenciesOptions:
 
 def latencies(options: LatenciesOptions) -> int:
     """Says how long the messages of a run took, and writes traces of it."""
-    from echelon.sim.measured_links import TRACES, measured, write_traces
+    from echelon.sim.measured_links import measured, write_traces
+    from echelon.sim.out_folder import TRACES
 
     found = measured(options.run)
     files = write_traces(options.run, found.arrivals, options.out or options.run / TRACES, replace=options.replace)

@@ -123,7 +123,7 @@ def test_a_run_on_a_wall_clock_is_replayed_exactly(real: Path, tmp_path: Path) -
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert done.stdout.splitlines()[-1] == "equal: these roles say what was recorded"
     facts = json.loads(echelon("replay", real, "--json").stdout)
-    assert sum(channel["equal"] for channel in facts["channels"]) > 16 * 30
+    assert sum(channel["equal"] for channel in facts["channels"]) >= 9 * 20
     changed = json.loads(echelon("replay", real, "--json", "--set", "law.lead=0.25").stdout)
     assert {channel["member"] for channel in changed["channels"] if channel["first_difference"]} <= {
         "g1", "g2", "g3", "coordinator",

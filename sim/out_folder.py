@@ -27,6 +27,7 @@ from echelon.errors import UsageError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
+from echelon.sim.observing import TICKET
 from echelon.sim.run_state import STATE
 
 NOTE: Final = ".echelon.json"
@@ -39,11 +40,12 @@ TABLES: Final = ("csv", "parquet")
 """Folders of exported tables"""
 
 
-def run_files(plan: Plan, bus: bool) -> tuple[str, ...]:
+def run_files(plan: Plan, bus: bool, observed: bool = False) -> tuple[str, ...]:
     """Returns the names of the files that a run may write, except for the files of users' parts.
 
-    `bus` says whether the run makes CAN frames."""
-    return (EFFECTIVE, STATE, RECORDING, CUT, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
+    `bus` says whether the run makes CAN frames, `observed` whether it is open to observers."""
+    with_bus = (LOG, *dbc_names(plan)) if bus else ()
+    return (EFFECTIVE, STATE, RECORDING, CUT, SUMMARY, REPORT, *with_bus, *((TICKET,) if observed else ()))
 
 
 @dataclass(slots=True)

@@ -56,10 +56,12 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         sys.stdout.reconfigure(line_buffering=True)  # a process may end without writing what is left
     body: Body
     try:
-        if not spec.virtual and spec.kind == "recorder":
+        if not spec.virtual and spec.kind in ("recorder", "observers"):
             os.nice(10)  # this process can wait, others cannot
         if spec.kind == "recorder":
             from echelon.sim.processes.watchers import run_recorder as body
+        elif spec.kind == "observers":
+            from echelon.sim.processes.observers import run_observers as body
         elif spec.kind in ("bridge", "drives", "referee"):
             from echelon.sim.processes.bus_processes import body_of
 
@@ -89,7 +91,8 @@ def _open(spec: ProcessSpec) -> Session:
             listen=spec.listen,
             connect=spec.connect,
             lockstep=spec.virtual,
-            own_receiver=spec.kind == "bridge" and not spec.member,
+            own_receiver=spec.kind == "observers" or (spec.kind == "bridge" and not spec.member),
+            credentials=spec.credentials,
         )
     except ValueError as error:
         raise StartError(str(error)) from None

@@ -17,8 +17,16 @@ BIN = Path(sys.executable).parent
 EXAMPLES = sorted(
     {*FIRST_LOOK, *(example for name, entry in ENTRIES.items() for example in entry.command(name).examples)}
 )
-LONG = ("echelon run paper", "echelon run lab", "echelon run drives", "echelon drives", "echelon completion bash")
-"""Beginnings of the examples that take long.  They are not run, nor are those with `vcan0`, which need that interface."""
+LONG = (
+    "echelon run paper",
+    "echelon run lab",
+    "echelon run drives",
+    "echelon drives",
+    "echelon observe",
+    "echelon completion bash",
+)
+"""Beginnings of the examples that take long, or need a run that goes on.  They are not run, nor are those with `vcan0`, which
+need that interface."""
 QUICK = [example for example in EXAMPLES if not example.startswith(LONG) and "vcan0" not in example]
 
 

@@ -4,6 +4,7 @@ import os
 import re
 import resource
 import signal
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing import Process
@@ -13,8 +14,10 @@ from subprocess import Popen
 import numpy as np
 import pytest
 
-from echelon.messages import Channel
+from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan.plan import Plan
+from echelon.runtime.session import Session
+from echelon.runtime.wire import data_key, encode, join, watch_key
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import parse
 from echelon.sim.processes.contract import ProcessSpec
@@ -178,6 +181,63 @@ def test_two_runs_at_once_never_meet(tmp_path: Path) -> None:
     digests = [summary_of(tmp_path / str(seed))["trace_digest"] for seed in (1, 2)]
     assert digests == [trace_of(plan).digest() for plan in plans]
     assert digests[0] != digests[1]
+
+
+class Attacker:
+    """A program without the run's secrets that connects to each process that listens, in threads of its own.  It hears what it
+    can, and forges states of a robot a few periods ahead."""
+
+    def __init__(self, supervisor: Supervisor, plan: Plan) -> None:
+        specs = supervisor._specs
+        self._run, self._plan = specs[0].run, plan
+        self._connect = [endpoint for spec in specs for endpoint in spec.listen]
+        self.heard: list[bytes] = []
+        self.forged = 0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._attack)
+
+    def __enter__(self) -> "Attacker":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _attack(self) -> None:
+        robot, run = self._plan.robots[0], self._run
+        state = np.full(len(STATE_FIELDS), 3.0)
+        with (
+            Session(listen=[], connect=self._connect, lockstep=False) as ear,
+            Session(listen=[], connect=self._connect, lockstep=False) as mouth,
+        ):
+            ear.subscribe([f"echelon/{run}/**", f"echelon/{run}/@watch/**"], self.heard.append)
+            said = mouth.publisher(data_key(run, robot.path, Channel.STATE))
+            copied = mouth.publisher(watch_key(run, "robot", robot.name))
+            while not self._done.wait(0.001):
+                number = self.forged % (self._plan.duration_ns // robot.period_ns)
+                payload = encode(Message(Channel.STATE, robot.index, number, number * robot.period_ns, state))
+                said.put(payload)
+                copied.put(join([payload]))
+                self.forged += 1
+
+
+@pytest.mark.parametrize("virtual", [True, False])
+def test_a_program_without_the_secrets_of_a_run_hears_and_changes_nothing(tmp_path: Path, virtual: bool) -> None:
+    plan = plan_of("lab", "duration=2.0")
+    supervisor = Supervisor(plan, tmp_path, run=f"attacked-{os.getpid()}", virtual=virtual)
+    with Attacker(supervisor, plan) as attacker:
+        outcome = supervisor.run()
+    assert outcome.failure is None
+    assert attacker.forged > 100
+    assert not attacker.heard
+    if virtual:
+        assert outcome.trace.digest() == trace_of(plan).digest()
+    else:
+        assert np.abs(outcome.trace.common()[1][..., 0] - 3.0).min() > 0
+    refused = [done.runner.refused for done in outcome.processes if done.runner is not None]
+    assert refused
+    assert not any(refused)
 
 
 A_PERIOD_LATE = 'links=[{source="**", receiver="**", delay=0.05}]'

@@ -1,6 +1,8 @@
 """The linear run cut open (`controller.prediction.linear_run.Loop`), part by part, and its frequency response."""
 
 from collections.abc import Iterator
+from functools import cached_property
+from math import ceil, inf, pi
 from typing import Final
 
 import numpy as np
@@ -8,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, csc_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
-from echelon.controller.prediction.crossings import SAME, Crossing
-from echelon.controller.prediction.linear_run import Loop
-from echelon.controller.prediction.spectrum import strong_parts
+from echelon.controller.prediction.crossings import SAME, Crossing, crossings, smallest_delay, unstable_roots
+from echelon.controller.prediction.gains import linear_gains
+from echelon.controller.prediction.linear_run import Edges, LinearRun, Loop
+from echelon.controller.prediction.spectrum import spectral_radius, strong_parts
 from echelon.plan.plan import Array
 
 SMALL: Final = 150
@@ -21,6 +24,10 @@ _TOGETHER: Final = 32
 """Number of frequencies that are computed at once"""
 
 Complex = NDArray[np.complex128]
+
+
+SLOW: Final = 1e-2
+"""Crossings are searched from this multiple of the slowest block's natural frequency upwards"""
 
 
 def parts(loop: Loop) -> "Iterator[Part]":
@@ -74,3 +81,59 @@ class Part:
         else:
             states = np.array([splu(csc_array(each * self._unit - self._sparse)).solve(self._into_x) for each in z])
         return np.asarray(self._VC @ states + self._VD), states
+
+
+class Cut:
+    """A linear run, cut open at some links, and where the eigenvalues of R(e^{jω}) cross the unit circle."""
+
+    def __init__(self, run: LinearRun, late: Edges, window: tuple[float, float] | None) -> None:
+        self._run, self._late, self._window = run, late, window
+        self._crossings: list[tuple[Part, Crossing]] = []
+
+    @cached_property
+    def is_stable(self) -> bool:
+        """True if the run is stable when it is not cut."""
+        return spectral_radius(self._run.map()) < 1
+
+    @cached_property
+    def found(self) -> list[Crossing] | None:
+        """The crossings; None if the criterion is not valid."""
+        run, plan = self._run, self._run.plan
+        stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
+        slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
+        low, high = self._window or (min(SLOW * slowest * run.hyperperiod_ns * 1e-9, 0.1), pi)
+        for part in parts(run.loop(self._late)):
+            if np.abs(part.eigenvalues(np.array([pi]))).max() >= 1:
+                return None
+            self._crossings += [(part, each) for each in crossings(part.eigenvalues, low, high)]
+        return [crossing for _, crossing in self._crossings]
+
+    def first_unstable(self) -> int | None:
+        """Returns the smallest number of hyperperiods, 1 at least, with which a run is unstable that is stable without."""
+        assert self.found is not None
+        if (edge := smallest_delay(self.found)) == inf:
+            return None
+        q = max(1, ceil(edge))
+        while unstable_roots(self.found, q) <= 0:
+            q += 1
+        return q
+
+    @property
+    def frequency(self) -> float | None:
+        """The frequency ω at which a root first reaches the edge of stability; None if none does."""
+        return min(((each.angle / each.omega, each.omega) for each in self.found or ()), default=(inf, None))[1]
+
+    def motions(self, q: int) -> Array | None:
+        """Returns the positions of the robots, (motions, N, 2), complex, in the motions that reached the edge of stability last
+        before there were q hyperperiods more; None if none did."""
+        assert self.found is not None
+        reached = sorted((each.angle / each.omega, at) for at, (_, each) in enumerate(self._crossings) if each.falls)
+        before = [at for delay, at in reached if delay <= q]
+        if not before:
+            return None
+        part, crossing = self._crossings[before[-1]]
+        index, values = part.motions(crossing)
+        whole = np.zeros((values.shape[1], 4 * len(self._run.plan.robots)), dtype=complex)
+        here = index < whole.shape[1]
+        whole[:, index[here]] = values[here].T
+        return whole.reshape(len(whole), -1, 4)[:, :, :2]

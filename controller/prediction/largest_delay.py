@@ -2,9 +2,9 @@
 
 All of these links get the same delay more, beyond what they have.  Where nodes and robots are time-driven it acts in ticks: a
 message is used at instants of its receiver, and said at instants of its source.  Where they are event-driven, delays between
-ticks count, and a message that comes just after an instant may be worse than one that comes at the next: a delay of 9.9 ms may be
-unstable where 10 ms are stable.  So the first tick is searched for at whose end, just before the next, the run is unstable; the
-boundary lies in this tick.
+ticks count, and a message that comes just after an instant may be worse than one that comes at the next: a delay of 9.9 ms may
+be unstable where 10 ms are stable.  So the first tick is searched for at whose end, just before the next, the run is unstable;
+the boundary lies in this tick.
 
 A *tick* is what divides the periods of all links and stages concerned, and the hyperperiod is m ticks.  A delay of k ticks more
 is q hyperperiods and r ticks, k = q m + r with 0 ≤ r < m.  For each r the linear run with r ticks more is cut open where the
@@ -21,17 +21,15 @@ R(-1) are smaller than 1; small maps confirm it.
 *Otherwise* delays are tried: one after the other up to `TRIED` ticks, then doubled and halved between.  The answer says so.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from math import ceil, gcd, inf, pi
+from math import gcd, inf, pi
 from typing import Final, Literal
 
 import numpy as np
 
-from echelon.controller.prediction.crossings import Crossing, crossings, smallest_delay, unstable_roots
-from echelon.controller.prediction.cut_loop import Part, parts
-from echelon.controller.prediction.gains import PredictionError, linear_gains
+from echelon.controller.prediction.crossings import smallest_delay, unstable_roots
+from echelon.controller.prediction.cut_loop import Cut
+from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.likeness import reduced
 from echelon.controller.prediction.linear_run import Edges, LinearRun, edge_of, edges_of, later
 from echelon.controller.prediction.schedule import LONGEST
@@ -39,7 +37,7 @@ from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.controller.transformation import Transformation
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
-from echelon.plan.plan import Array, Plan
+from echelon.plan.plan import Plan
 
 TRIED: Final = 50
 """Ticks up to which all delays are tried, where the criterion is not valid"""
@@ -52,9 +50,8 @@ CONFIRMED: Final = 800
 WORTH: Final = 100
 """Largest delay for which a result is confirmed by maps [hyperperiods]"""
 REMAINDERS: Final = 20
-"""Largest number of ticks in a hyperperiod for which each remainder r is computed; with more the last hyperperiod is searched"""
-SLOW: Final = 1e-2
-"""Crossings are searched from this multiple of the slowest block's natural frequency upwards"""
+"""Largest number of ticks in a hyperperiod for which each remainder r is computed; with more, the last hyperperiod is
+searched"""
 NEAR: Final = 2.0
 """Between two ticks, crossings are searched only within this factor of the frequency at which the run first becomes unstable"""
 SHARED: Final = 0.2
@@ -76,8 +73,8 @@ class LargestDelay:
     """Why it is not more.  `unstable`: one tick more is unstable; `timeout`: it is older than a link's timeout allows; `never`:
     no delay is unstable; `limit`: longer delays have not been tried out"""
     beyond_s: float = 0.0
-    """Where stages are event-driven: every delay up to `ticks` ticks and this is stable and young enough [s]; negative if a delay
-    between two of these ticks is not"""
+    """Where stages are event-driven: every delay up to `ticks` ticks and this is stable and young enough [s]; negative if a
+    delay between two of these ticks is not"""
     tried: bool = False
     """True: found by trying delays, which may miss an unstable delay below a stable one"""
     limits: tuple[str, ...] = ()
@@ -117,7 +114,7 @@ class _Search:
         self._links = [link for link in plan.links if edge_of(link) in late]
         self._tick_ns = gcd(*(link.period_ns for link in self._links), *run.periods(late))
         self._remainders = run.hyperperiod_ns // self._tick_ns
-        self._cuts: dict[int, _Cut] = {}
+        self._cuts: dict[int, Cut] = {}
         self._window: tuple[float, float] | None = None
 
     def in_ticks(self) -> LargestDelay:
@@ -196,15 +193,16 @@ class _Search:
             return unstable_roots(cut.found, whole) <= 0
         return spectral_radius(LinearRun(later(self._patient, self._late, extra_ns)).map()) < 1
 
-    def _cut(self, extra_ns: int) -> "_Cut":
+    def _cut(self, extra_ns: int) -> Cut:
         """Returns the run with these messages later, cut open."""
         if extra_ns not in self._cuts:
             run = LinearRun(later(self._patient, self._late, extra_ns))
-            self._cuts[extra_ns] = _Cut(run, self._late, self._window)
+            self._cuts[extra_ns] = Cut(run, self._late, self._window)
         return self._cuts[extra_ns]
 
     def _first_unstable(self, part_ns: int = 0) -> int | None:
-        """Returns the smallest number of ticks for which the run is unstable with these and `part_ns` more; -1 if there is none.
+        """Returns the smallest number of ticks for which the run is unstable with these and `part_ns` more; -1 if there is
+        none.
 
         Returns None if the criterion is not valid for the run, or is not confirmed by the maps."""
         least = inf
@@ -265,7 +263,8 @@ class _Search:
         return min(getattr(self, "_reached", NEVER_NS), longest_ns // self._tick_ns)
 
     def _first_too_old(self, unstable: int | None) -> int | None:
-        """Returns the smallest number of extra ticks, below `unstable`, with which messages are too old; None if there is none."""
+        """Returns the smallest number of extra ticks, below `unstable`, with which messages are too old; None if there is
+        none."""
         if all(link.timeout_ns >= NEVER_NS for link in self._links):
             return None
         low, high = 0, 1
@@ -301,61 +300,3 @@ class _Search:
                 moves[names] = max(moves.get(names, 0.0), float(np.linalg.norm(z[:, rows])))
         most = max(moves.values())
         return tuple(name for names in moves if moves[names] > SHARED * most for name in names)
-
-
-class _Cut:
-    """A linear run, cut open at some links, and where the eigenvalues of R(e^{jω}) cross the unit circle."""
-
-    def __init__(self, run: LinearRun, late: Edges, window: tuple[float, float] | None) -> None:
-        self._run, self._late, self._window = run, late, window
-        self._crossings: list[tuple[Part, Crossing]] = []
-
-    @cached_property
-    def is_stable(self) -> bool:
-        """True if the run is stable when it is not cut."""
-        return spectral_radius(self._run.map()) < 1
-
-    @cached_property
-    def found(self) -> list[Crossing] | None:
-        """The crossings; None if the criterion is not valid."""
-        run, plan = self._run, self._run.plan
-        stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
-        slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
-        low, high = self._window or (min(SLOW * slowest * run.hyperperiod_ns * 1e-9, 0.1), pi)
-        for part in parts(run.loop(self._late)):
-            if np.abs(part.eigenvalues(np.array([pi]))).max() >= 1:
-                return None
-            self._crossings += [(part, each) for each in crossings(part.eigenvalues, low, high)]
-        return [crossing for _, crossing in self._crossings]
-
-    def first_unstable(self) -> int | None:
-        """Returns the smallest number of hyperperiods, 1 at least, with which a run is unstable that is stable without."""
-        assert self.found is not None
-        if (edge := smallest_delay(self.found)) == inf:
-            return None
-        q = max(1, ceil(edge))
-        while unstable_roots(self.found, q) <= 0:
-            q += 1
-        return q
-
-    @property
-    def frequency(self) -> float | None:
-        """The frequency ω at which a root first reaches the edge of stability; None if none does."""
-        return min(((each.angle / each.omega, each.omega) for each in self.found or ()), default=(inf, None))[1]
-
-    def motions(self, q: int) -> Array | None:
-        """Returns the positions of the robots, (motions, N, 2), complex, in the motions that reached the edge of stability last
-        before there were q hyperperiods more; None if none did."""
-        assert self.found is not None
-        reached = sorted(
-            (each.angle / each.omega, at) for at, (_, each) in enumerate(self._crossings) if each.falls
-        )
-        before = [at for delay, at in reached if delay <= q]
-        if not before:
-            return None
-        part, crossing = self._crossings[before[-1]]
-        index, values = part.motions(crossing)
-        whole = np.zeros((values.shape[1], 4 * len(self._run.plan.robots)), dtype=complex)
-        here = index < whole.shape[1]
-        whole[:, index[here]] = values[here].T
-        return whole.reshape(len(whole), -1, 4)[:, :, :2]

@@ -12,7 +12,7 @@ eigenvalues, and `reduced` leaves out the rest.  A formation of 100 groups of te
 """
 
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
 from math import gcd
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from echelon.controller.prediction.gains import linear_gains
 from echelon.controller.prediction.linear_run import Edges, edge_of
-from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan, ShapePlan
+from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, ShapePlan
 
 Numbers = tuple[float, ...]
 
@@ -41,7 +41,9 @@ def likeness(plan: Plan, late: Edges = frozenset()) -> Likeness:
     """Returns what is like what in a plan, where the links `late` are unlike the others."""
     links: dict[int, list[Hashable]] = {member.index: [] for member in plan.formation}
     for link in plan.links:
-        child = next((end for end in (link.source, link.receiver) if end in links and _parent(plan, end) in _ends(link)), None)
+        child = next(
+            (end for end in (link.source, link.receiver) if end in links and _parent(plan, end) in _ends(link)), None
+        )
         if child is not None:
             bare = replace(link, source=0, receiver=0, size=None, name="")
             links[child].append((bare.channel, repr(bare), repr(bare.delays), edge_of(link) in late))
@@ -49,21 +51,22 @@ def likeness(plan: Plan, late: Edges = frozenset()) -> Likeness:
     below = [0] * len(plan.formation)
     symmetric = set()
     for robot in plan.robots:
-        own = robot.period_ns, robot.torque_period_ns, robot.event_driven
-        below[robot.index] = number(("robot", own, tuple(sorted(links[robot.index], key=repr))))
+        periods = robot.period_ns, robot.torque_period_ns, robot.event_driven
+        below[robot.index] = number(("robot", periods, _sorted(links[robot.index])))
     for node in plan.nodes:
-        gains = _scalars(plan, plan.block_of(node.index))
-        children: Hashable = [(below[child], weight) for child, weight in zip(node.children, node.weights, strict=True)]
-        if gains is not None and not plan.coupled and not plan.bus_roles:
+        block = plan.block_of(node.index)
+        numbers = _scalars(plan, block)
+        children = [(below[child], weight) for child, weight in zip(node.children, node.weights, strict=True)]
+        of_gains: Hashable
+        of_children: Hashable
+        if numbers is not None and not plan.coupled and not plan.bus_roles:
             symmetric.add(node.index)
-            children = frozenset(Counter(children).items())
+            of_gains, of_children = numbers, frozenset(Counter(children).items())
         else:
-            gains = ("matrix", *(each.tobytes() for each in _matrices(plan, plan.block_of(node.index))))
-            children = tuple(children)
-        if plan.coupled:
-            gains = (*gains, node.index)
-        own = node.period_ns, node.event_driven
-        below[node.index] = number(("node", own, gains, children, tuple(sorted(links[node.index], key=repr))))
+            matrices = tuple(each.tobytes() for each in _matrices(plan, block))
+            of_gains, of_children = (matrices, node.index if plan.coupled else None), tuple(children)
+        own = node.period_ns, node.event_driven, of_gains, of_children
+        below[node.index] = number(("node", own, _sorted(links[node.index])))
     kinds = [0] * len(plan.formation)
     for node in reversed(plan.nodes):
         if node.parent is None:
@@ -176,12 +179,16 @@ def _scalars(plan: Plan, block: BlockPlan) -> Hashable:
     return tuple(float(each[0, 0]) for each in matrices)
 
 
+def _sorted(things: Iterable[Hashable]) -> Hashable:
+    return tuple(sorted(things, key=repr))
+
+
 def _parent(plan: Plan, member: int) -> int | None:
     return plan.formation[member].parent
 
 
-def _ends(link: object) -> tuple[int, int]:
-    return link.source, link.receiver  # type: ignore[attr-defined]
+def _ends(link: LinkPlan) -> tuple[int, int]:
+    return link.source, link.receiver
 
 
 def _is_below(plan: Plan, robot: int, node: int) -> bool:

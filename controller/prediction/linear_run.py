@@ -208,10 +208,10 @@ class LinearRun:
                     if time_ns % period_ns:
                         continue
                     number = time_ns // period_ns
-                    if (wire := wires.get((member, channel, True))) is not None:
-                        said[wire, number] = values[channel]
-                    if (wire := wires.get((member, channel, False))) is not None:
-                        wire.said[number] = values[channel]
+                    if (cut_wire := wires.get((member, channel, True))) is not None:
+                        said[cut_wire, number] = values[channel]
+                    if (whole_wire := wires.get((member, channel, False))) is not None:
+                        whole_wire.said[number] = values[channel]
 
         rows = Rows(columns)
         for role, at, unit in zip(self._roles, self._places[:-1], units, strict=True):

@@ -6,7 +6,7 @@ A link lies between a member and its parent, so it belongs to the parent's node,
 On a closed torque path the wanted torques are a class of their own."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from echelon.controller.prediction.likeness import likeness
@@ -42,10 +42,9 @@ def link_sets(plan: Plan) -> list[LinkSet]:
 
     def add(kind: Kind, name: str, edges: Edges, like: tuple[str, ...] = ()) -> None:
         if edges:
-            layer, channel = ({layers[one] for one in edges}, {one[2] for one in edges})
-            found.append(
-                LinkSet(kind, name, *(only.pop() if len(only) == 1 else None for only in (layer, channel)), edges, like)
-            )
+            of, carry = {layers[one] for one in edges}, {one[2] for one in edges}
+            layer, channel = of.pop() if len(of) == 1 else None, carry.pop() if len(carry) == 1 else None
+            found.append(LinkSet(kind, name, layer, channel, edges, like))
 
     for layer in (*LAYERS, "robot"):
         for channel in CHANNELS:
@@ -90,9 +89,3 @@ def _layer(plan: Plan, link: LinkPlan | tuple[int, int, Channel]) -> str:
     source, receiver, _ = link if isinstance(link, tuple) else edge_of(link)
     node = max(source, receiver)  # children before parents
     return plan.block_of(node).layer if node < len(plan.formation) else "robot"
-
-
-def unlike(sets: list[LinkSet]) -> list[LinkSet]:
-    """Returns the sets without those that have the same links as one before."""
-    seen: set[Edges] = set()
-    return [replace(one) for one in sets if one.edges not in seen and not seen.add(one.edges)]  # type: ignore[func-returns-value]

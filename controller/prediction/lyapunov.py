@@ -1,4 +1,4 @@
-"""Bounds on ε_1, ε_2, … by composite Lyapunov functions (paper, Theorem 1), as corrected in docs/architecture.md, 2.11.
+"""Bounds on ε_1, ε_2, … by composite Lyapunov functions (paper, Theorem 1), as corrected in docs/architecture.md, 2.12.
 
 Layer i consists of the blocks whose time scale is the product of the first i of `law.epsilon`.  χ are the layers before it, E_f
 is the layer, with σ_f = ε_i σ_{i-1}; faster layers have settled.  P_χ and P_f solve Aᵀ P + P A = -1 for the closed loop A_χ of
@@ -14,8 +14,9 @@ where C are the couplings.  By the Schur complement Q is positive definite if an
     1/σ_f > λ_max( P_f C_ff + C_ffᵀ P_f + Sᵀ S/(d (1-d)) )
 
 whose right side is convex in log(d/(1-d)), so its least value over d is found by a search along one line.  For ε_1 this is the
-paper's V; for the next ε the paper composes V_χ again, which needs ε_1 below its own bound.  The paper's Q leaves out the part of
-S with C_χf (label liap01), and its bound (label be1) does not follow from the Schur complement: it is reported, not relied on.
+paper's V; for the next ε the paper composes V_χ again, which needs ε_1 below its own bound.  The paper's Q leaves out the part
+of S with C_χf (label liap01), and its bound (label be1) does not follow from the Schur complement: it is reported, not relied
+on.
 The paper's appendix bounds V̇ by norms (labels condeps, epsval, dval): with α_1 = α_2 = 1, β_1 = 2 |P_χ C_χf|,
 β_2 = 2 |P_f C_fχ| and γ = λ_max(P_f C_ff + C_ffᵀ P_f), at least 0,
 
@@ -33,7 +34,6 @@ from scipy.optimize import minimize_scalar
 
 from echelon.controller.prediction.time_scales import ErrorDynamics
 from echelon.plan.plan import Array
-
 
 ZERO: Final = 1e-12
 """1/σ up to this counts as zero [1/s]: no coupling, so every ε is stable"""

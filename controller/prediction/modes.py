@@ -101,8 +101,8 @@ def _each_once(values: Complex, order: Array) -> tuple[complex, ...]:
 
 
 def linear_errors(plan: Plan) -> tuple[NDArray[np.int64], Array]:
-    """Returns the errors of all blocks, (T, 2N) [m], at the beginning of each hyperperiod (T,) [ns] of a run from the scenario's
-    start, as the linear run has them.
+    """Returns the errors of all blocks, (T, 2N) [m], at the beginning of each hyperperiod, (T,) [ns]: those of the linear run
+    from the scenario's start.
 
     Raises PredictionError as `LinearRun` does, ValueError for more than `MOST` robots."""
     if len(plan.robots) > MOST:
@@ -110,8 +110,8 @@ def linear_errors(plan: Plan) -> tuple[NDArray[np.int64], Array]:
     run, transformation = LinearRun(plan), Transformation(plan)
     matrix, H = run.map(), run.hyperperiod_ns * 1e-9
     desired = make_trajectory(plan.trajectory).at(0.0)
-    x = np.zeros(run.size)
-    state = x[: 4 * len(plan.robots)].reshape(-1, 4)
+    x: Array = np.zeros(run.size)
+    state: Array = x[: 4 * len(plan.robots)].reshape(-1, 4)
     places = transformation.backward(transformation.desired(desired[0]))
     state[:, :2] = np.array([robot.start for robot in plan.robots]) - places
     state[:, 2:] = -H * desired[1]
@@ -120,6 +120,6 @@ def linear_errors(plan: Plan) -> tuple[NDArray[np.int64], Array]:
     with np.errstate(all="ignore"):
         for row in errors:
             row[:] = transformation.forward(state[:, :2]).ravel()
-            x = matrix @ x
+            x = np.asarray(matrix @ x, dtype=np.float64).reshape(-1)
             state = x[: 4 * len(plan.robots)].reshape(-1, 4)
     return times_ns, errors

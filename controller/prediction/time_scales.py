@@ -1,4 +1,4 @@
-"""The closed loop in continuous time, and how far time scales and couplings may go (docs/architecture.md, 2.11).
+"""The closed loop in continuous time, and how far time scales and couplings may go (docs/architecture.md, 2.12).
 
 With E_b = (Z_b/σ_b, Ż_b) in errors (paper, proof of Theorem 1) the closed loop of labels eq45 and eq207 is
 
@@ -114,8 +114,9 @@ def error_dynamics(plan: Plan, counts: Sequence[int]) -> ErrorDynamics:
 
 
 def largest_epsilon(loop: ErrorDynamics, epsilon: Sequence[float], number: int) -> float:
-    """Returns the largest ε_number (from 1 on): every smaller one is stable, down to `LOW` of the present one.  0 if the smallest
-    is not stable, infinite if every one is up to `HIGH` times the present one."""
+    """Returns the largest ε_number (from 1 on): every smaller one is stable, down to `LOW` of the present one.
+
+    0 if the smallest is not stable, infinite if every one is up to `HIGH` times the present one."""
     if (coupled := loop.coupled()) is None or not (coupled.count >= number).any():
         return inf if loop.abscissa() < 0 else 0.0
     return epsilon[number - 1] * first_root(lambda by: coupled.abscissa(number, by))

@@ -55,7 +55,15 @@ def torque_loops(plan: Plan, speeds: list[float]) -> tuple[TorqueLoop, ...]:
     for robot, speed in zip(plan.robots, speeds, strict=True):
         h_ns = robot.torque_period_ns
         periods = -(-late.get(robot.index, 0) // h_ns)
-        like = (robot.model.use, robot.model.made, robot.mass, robot.inertia, robot.wheel_radius, robot.arm, robot.offset)
+        like = (
+            robot.model.use,
+            robot.model.made,
+            robot.mass,
+            robot.inertia,
+            robot.wheel_radius,
+            robot.arm,
+            robot.offset,
+        )
         key = (repr(like), h_ns, speed, periods)
         if key not in known:
             known[key] = _of_robot(robot, speed, h_ns * 1e-9, periods)

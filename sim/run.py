@@ -101,7 +101,7 @@ def execute(
         ).run()
     can = outcome.can
     if can is not None and (can.referee is None or outcome.stopped):
-        common_ns, _ = outcome.trace.common()
+        common_ns = outcome.trace.common_ns()
         until_ns = int(common_ns[-1]) if outcome.stopped and len(common_ns) else None
         whole = not (outcome.failure or outcome.stopped)
         try:
@@ -220,7 +220,7 @@ def _in_process(
 
 def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: datetime) -> RunFacts:
     """Returns the facts about a run for its summary: how it was made, how fast it was, what it used."""
-    common_ns, _ = outcome.trace.common()
+    common_ns = outcome.trace.common_ns()
     # The period that begins at the last instant is simulated, too.
     simulated_s = (int(common_ns[-1]) + plan.robots[0].period_ns) / 1e9 if len(common_ns) else 0.0
     factor = simulated_s / outcome.wall_s if outcome.wall_s > 0 else None

@@ -134,7 +134,7 @@ class Supervisor:
             signal.signal(signal.SIGTERM, previous)
         processes = [child.done for child in self._children if child.done is not None]
         outcome = outcome_of(self.plan, processes, failure, startup_s, wall_s)
-        common_ns, _ = outcome.trace.common()
+        common_ns = outcome.trace.common_ns()
         if stall is not None and len(common_ns):
             outcome.failure = stall.text(f"t = {common_ns[-1] / 1e9:g} s")
         return outcome

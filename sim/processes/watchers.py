@@ -158,7 +158,7 @@ class RunRecorder:
     def progress(self) -> RecorderProgress:
         """Returns the progress of the recording."""
         states_ns, states = self._trace.last() or (0, None)
-        return RecorderProgress(self._time_ns, self.messages, states_ns, states, self.recorder.failure, self.lost)
+        return RecorderProgress(self._time_ns, self.messages, states_ns, states, self._failure, self.lost)
 
     def close(self, links: Sequence[LinkCounts]) -> None:
         """Writes the links' counts and ends the recording."""
@@ -167,7 +167,12 @@ class RunRecorder:
 
     def report(self, refused: int = 0) -> RecorderReport:
         """Returns the report with the trace; `refused` is the number of messages that were refused before."""
-        return RecorderReport(self._trace.build(), self.messages, refused, self.recorder.failure, self.lost)
+        trace, refused = self._trace.build(), refused + self._trace.surplus
+        return RecorderReport(trace, self.messages, refused, self._failure, self.lost)
+
+    @property
+    def _failure(self) -> str | None:
+        return self.recorder.failure or self._trace.failure
 
 
 def _is_lost(message: Message) -> bool:

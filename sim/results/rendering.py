@@ -73,10 +73,15 @@ def _schema(adapter: Any, record: type, title: str, modules: Sequence[ModuleType
     """Returns the JSON schema of a record; those of its parts are in some modules."""
     schema: dict[str, Any] = adapter.json_schema(mode="serialization")
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title} | schema
-    known = {value.__name__: value for module in modules for value in vars(module).values() if is_dataclass(value)}
+    known = {
+        value.__name__: value
+        for module in modules
+        for value in vars(module).values()
+        if isinstance(value, type) and is_dataclass(value)
+    }
     for name, table in [*schema.get("$defs", {}).items(), (record.__name__, schema)]:
         if name in known:
-            _describe(table, known[name])  # type: ignore[arg-type]
+            _describe(table, known[name])
     return schema
 
 

@@ -6,8 +6,8 @@ import pytest
 from echelon.controller.laws.law import LinearGains
 from echelon.controller.prediction.block_margin import delay_margin
 from echelon.controller.prediction.largest_delay import largest_extra_delay
-from echelon.controller.prediction.link_sets import link_sets
 from echelon.controller.prediction.linear_run import Edges, LinearRun, edges_of, later
+from echelon.controller.prediction.link_sets import link_sets
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.messages import Channel
 from echelon.plan.plan import Plan

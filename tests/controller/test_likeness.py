@@ -11,7 +11,8 @@ from echelon.controller.prediction.linear_run import LinearRun, edge_of, later
 from echelon.controller.prediction.link_sets import link_sets
 from echelon.controller.prediction.modes import block_modes
 from support.runs import plan_of
-from support.trees import like_groups, plan_of as plan_of_table, random_epsilon, scenario, with_random_gains
+from support.trees import like_groups, random_epsilon, scenario, with_random_gains
+from support.trees import plan_of as plan_of_table
 
 TREES = (
     ((None,) * 3,) * 3,

@@ -5,11 +5,11 @@ import pytest
 
 from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.likeness import reduced
-from echelon.controller.prediction.link_sets import link_sets
 from echelon.controller.prediction.linear_run import Edges, LinearRun, later
+from echelon.controller.prediction.link_sets import link_sets
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.plan.plan import Plan
-from support.random_formations import FREE, AT_REST, dies_away, random_formation
+from support.random_formations import AT_REST, FREE, dies_away, random_formation
 from support.runs import plan_of
 
 CLOSE = 0.01

@@ -8,11 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from echelon.controller.prediction.linear_run import later
+from echelon.controller.prediction.linear_run import LinearRun, later
 from echelon.controller.prediction.mean_square import gilbert, mean_square
 from echelon.controller.prediction.random_run import RandomRun
 from echelon.controller.prediction.random_steps import Chances, moment
 from echelon.controller.prediction.second_moment import SecondMoment
+from echelon.controller.prediction.spectrum import spectral_radius
+from echelon.controller.prediction.typical_growth import typical_growth
 from echelon.messages import Channel
 from echelon.plan.delay_tables import LOST, DelayTrace
 from echelon.plan.plan import Array, Plan
@@ -183,3 +185,20 @@ def test_growth_with_bursts_is_that_of_the_chains_kronecker_map(burst, loss):
         found = SecondMoment(part, chances)
         assert (found.gain() < 1) == (expected < 1)
         assert found.gain(1.001 * expected) < 1 < found.gain(0.999 * expected)
+
+
+def test_typical_runs_decay_where_the_second_moment_grows():
+    """The pair's critical loss in the mean square is 0.530; its typical growth passes zero between 0.6 and 0.7."""
+    for loss, decays in ((0.6, True), (0.7, False)):
+        found = typical_growth(pair(), Channel.STATE, loss)
+        assert (found.rate < 0) == decays
+        assert abs(found.rate) > 3 * found.error
+    boundary = mean_square(pair(), Channel.STATE).loss
+    assert boundary is not None
+    assert boundary < 0.6
+
+
+def test_without_loss_typical_growth_is_that_of_the_map():
+    plan = pair()
+    found = typical_growth(plan, Channel.STATE, 0.0)
+    assert found.rate == pytest.approx(np.log(spectral_radius(LinearRun(plan).map())), abs=2e-3)

@@ -79,7 +79,7 @@ def expected_cost(plan: Plan) -> Cost | None:
     run, waits = losses.run, waiting(plan)
     chances = losses.chances(0.0)
     pi = chances.stationary()[:, None, None]
-    starts = [_at_rest(losses, tick) for tick in range(len(waits))]
+    starts = [registers_at_rest(losses, tick) for tick in range(len(waits))]
     longer = 1 - np.cumsum(waits)  # probability that the wait is longer than n hyperperiods
     # The wait ends with a hyperperiod in which all comes, or with one in which only what was missing comes.
     up = np.array([link.channel in _UP for link in plan.links])
@@ -177,7 +177,7 @@ def _certain(chain: Array, loss: float) -> Array:
     return np.stack([(1 - loss) * step, loss * step])
 
 
-def _at_rest(losses: Losses, tick: int) -> Array:
+def registers_at_rest(losses: Losses, tick: int) -> Array:
     """Returns the registers after some hyperperiods in which robots rested where they start and states came."""
     run, plan = losses.run, losses.run.plan
     rest = np.zeros(run.registers.count)
@@ -203,8 +203,8 @@ def _start(plan: Plan, t: float) -> Array:
     return np.hstack((p, np.tile(-rate, (len(p), 1))))
 
 
-def _weighted(plan: Plan, losses: Losses, of_part: Callable[[Part], Array]) -> Array:
-    """Returns tr(W_b X) of each block, with the X of each part."""
+def block_rows(plan: Plan, losses: Losses) -> Array:
+    """Returns the errors of all blocks as rows over the registers, (2 robots, registers)."""
     robots, count = len(plan.robots), losses.run.registers.count
     places = np.concatenate([losses.run.registers.memory(number)[:2] for number in range(robots)])
     unit = np.eye(2 * robots).reshape(2 * robots, robots, 2)
@@ -212,7 +212,12 @@ def _weighted(plan: Plan, losses: Losses, of_part: Callable[[Part], Array]) -> A
     phi = np.stack([transformation.forward(each).ravel() for each in unit], axis=1)
     rows = np.zeros((2 * robots, count))
     rows[:, places] = phi
-    values = np.zeros(len(plan.blocks))
+    return rows
+
+
+def _weighted(plan: Plan, losses: Losses, of_part: Callable[[Part], Array]) -> Array:
+    """Returns tr(W_b X) of each block, with the X of each part."""
+    rows, values = block_rows(plan, losses), np.zeros(len(plan.blocks))
     for part in losses.parts:
         X, own = of_part(part), rows[:, part.registers]
         squares = np.einsum("ia,ab,ib->i", own, X, own)

@@ -57,7 +57,7 @@ def mean_square(plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float
     With `burst` they lose messages in bursts of this mean length, none between bursts and all within them (Gilbert).
 
     Raises PredictionError if nothing exact can be said of the plan, ValueError if there are no such links."""
-    losses = Losses(plan, _places(plan, links), burst)
+    losses = Losses(plan, places_of(plan, links), burst)
     at_own = losses.radius(losses.own)
     if losses.gain(0.0) >= 1:
         return LossBoundary(None, "unstable", burst, at_own)
@@ -174,7 +174,7 @@ def _edge(gain: Callable[[float], float], low: float, high: float) -> float:
     return low
 
 
-def _places(plan: Plan, links: Sequence[LinkPlan] | Channel) -> list[int]:
+def places_of(plan: Plan, links: Sequence[LinkPlan] | Channel) -> list[int]:
     """Returns the places of links in `plan.links`."""
     some = ruled_links(plan, links) if isinstance(links, Channel) else links
     found = [at for at, link in enumerate(plan.links) if any(link is each for each in some)]

@@ -1,7 +1,5 @@
 """Expected cost: against the mean of many runs, a run without loss, and Lyapunov's equation."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
@@ -9,37 +7,13 @@ from scipy.linalg import solve_discrete_lyapunov
 from echelon.controller.prediction.cost import Cost, expected_cost, steady_cost, waiting
 from echelon.controller.prediction.linear_run import LinearRun
 from echelon.controller.transformation import Transformation
-from echelon.plan.plan import Plan
 from echelon.sim.batch.batch import run_many
+from support.near_formation import T, near_formation
 from support.trees import plan_of, scenario
 
-T = 0.025
-TREE = ((None, None), (None, None, None))
 RUNS = 400
 SURE = 4.0
 """Standard errors of the mean that the runs may be off; they are about 0.5 %"""
-
-
-def plan_with(links: list[dict[str, object]], timing: str = "event_driven", duration: float = 16.0) -> Plan:
-    """Returns robots of the paper's plant, 0.3 m from a formation that drives straight on."""
-    table = scenario(
-        TREE,
-        np.random.default_rng(4),
-        duration=duration,
-        law={"epsilon": [0.5, 0.5], "lead": 0.5},
-        periods={"acceleration": T, "torque": T / 2},
-        trajectory={"kind": "line", "velocity": (0.5, 0.0)},
-        timing=timing,
-        links=links,
-    )
-    plan = plan_of(table)
-    transformation, random = Transformation(plan), np.random.default_rng(1)
-    starts = transformation.backward(transformation.desired(np.zeros(2))) + random.normal(size=(5, 2), scale=0.3)
-    robots = [
-        replace(robot, start=tuple(start), heading=0.0)
-        for robot, start in zip(plan.robots, starts.tolist(), strict=True)
-    ]
-    return replace(plan, robots=tuple(robots))
 
 
 def of(cost: Cost | None) -> np.ndarray:
@@ -54,7 +28,7 @@ def of(cost: Cost | None) -> np.ndarray:
     [{"channel": "command", "loss": 0.4}],
 ])  # fmt: skip
 def test_cost_is_the_mean_of_runs(links, timing):
-    plan = plan_with(links, timing)
+    plan = near_formation(links, timing)
     runs = run_many(plan, range(RUNS))
     ise = runs.blocks["ise"]
     error = ise.std(axis=0) / np.sqrt(len(ise))
@@ -66,13 +40,13 @@ def test_cost_is_the_mean_of_runs(links, timing):
 
 
 def test_cost_without_loss_is_that_of_the_run():
-    plan = plan_with([])
+    plan = near_formation([])
     (ise,) = run_many(plan, [1]).blocks["ise"]
     assert of(expected_cost(plan)) == pytest.approx(ise, rel=2e-3)
 
 
 def test_steady_errors_without_loss_are_those_of_lyapunovs_equation():
-    plan, q = plan_with([]), 0.3
+    plan, q = near_formation([]), 0.3
     run = LinearRun(plan)
     M, H = run.map().toarray(), T
     Q = np.zeros_like(M)
@@ -93,8 +67,8 @@ def test_steady_errors_without_loss_are_those_of_lyapunovs_equation():
 @pytest.mark.parametrize("timing", ["event_driven", "time_driven"])
 def test_bursts_as_short_as_independent_losses_cost_the_same(timing):
     link = {"channel": "state", "source": "g0/r0"}
-    one = plan_with([link | {"loss": 0.3}], timing)
-    other = plan_with([link | {"loss": {"mean": 0.3, "burst": 1 / 0.7}}], timing)
+    one = near_formation([link | {"loss": 0.3}], timing)
+    other = near_formation([link | {"loss": {"mean": 0.3, "burst": 1 / 0.7}}], timing)
     assert any(link.bursts for link in other.links)
     assert of(expected_cost(other)) == pytest.approx(of(expected_cost(one)), rel=1e-5)
     noisy, also = steady_cost(one, 0.1), steady_cost(other, 0.1)
@@ -102,7 +76,7 @@ def test_bursts_as_short_as_independent_losses_cost_the_same(timing):
 
 
 def test_no_cost_where_errors_do_not_vanish():
-    assert expected_cost(plan_with([{"loss": 0.97}])) is None
+    assert expected_cost(near_formation([{"loss": 0.97}])) is None
 
 
 def test_robots_wait_until_the_coordinator_has_heard_of_all():

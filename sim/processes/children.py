@@ -208,6 +208,7 @@ def list_specs(
         "run": run,
         "plan": plan,
         "virtual": virtual,
+        "recorded": recorded,
         "folder": str(folder),
         "can_urls": can_urls,
         "scenario_toml": scenario_toml,

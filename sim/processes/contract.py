@@ -59,6 +59,8 @@ class ProcessSpec:
     """True: its messages also go to watchers"""
     member: bool = True
     """True: it ends by itself when the run is over.  False: it waits for the order to finish"""
+    recorded: bool = False
+    """True: the run is recorded into `folder`"""
     folder: str = ""
     can_urls: tuple[str, ...] = ()
     """A URL for each bus of the plan; empty: no bus"""

@@ -25,6 +25,7 @@ from typing import Any, Final
 
 from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
+from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.sim.observing import new_gate
 from echelon.sim.processes.children import Child, last_words_of, list_specs, start
 from echelon.sim.processes.contract import ProcessSpec
@@ -83,6 +84,7 @@ class Supervisor:
         order: Callable[[list[ProcessSpec]], list[ProcessSpec]] = lambda specs: specs,
     ) -> None:
         self.plan, self.virtual = plan, virtual
+        self._folder, self._notes_arrivals = folder, recorded and not virtual
         self.progress = Progress()
         self._show = show
         told = scenario_toml, metadata or {}, part_files or {}
@@ -94,7 +96,11 @@ class Supervisor:
         self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)
 
     def run(self) -> Outcome:
-        """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised."""
+        """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised.
+
+        Raises OSError if the file of arrivals cannot be made."""
+        if self._notes_arrivals:
+            (self._folder / ARRIVALS).write_bytes(b"")  # members append to it
         begun_s = time.monotonic()
         failure: str | None = None
         stall: StallError | None = None

@@ -39,12 +39,15 @@ def run_in_shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder with two runs and a scenario."""
+    """A user's folder with three runs and a scenario."""
     folder = tmp_path_factory.mktemp("user")
     quick = ("--set", "duration=0.5", "--set", "claims=[]", "--engine", "inprocess", "--quiet")
     for name in ("demo", "avoiding"):
         done = echelon("run", "lab", *quick, "--out", f"runs/{name}", cwd=folder)
         assert done.returncode == 0, done.stderr
+    on_a_wall_clock = ("--clock", "wall", "--can", "none", *quick[:4], "--quiet", "--out", "runs/real")
+    assert echelon("run", "lab", *on_a_wall_clock, cwd=folder).returncode in (0, 1)
+    assert echelon("latencies", "runs/real", cwd=folder).returncode == 0
     assert echelon("new", "my", "--groups", "1x2", cwd=folder).returncode == 0
     (folder / "my.toml").rename(folder / "kept.toml")
     return folder

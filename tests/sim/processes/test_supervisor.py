@@ -24,7 +24,10 @@ from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.failures import NAMED, few
 from echelon.sim.processes.outcome import Outcome, Progress
 from echelon.sim.processes.supervisor import Supervisor
+from echelon.sim.recording.arrivals import read_arrivals
 from echelon.sim.recording.mcap_reader import read_trace, recover
+from echelon.sim.results.trace import Trace
+from support.arrivals import with_traces
 from support.runs import (
     descendants,
     kill_session,
@@ -258,6 +261,66 @@ def test_on_a_wall_clock_each_act_is_at_most_a_period_late_when_nothing_is_late(
             for trace in (trace_of(slowest), outcome.trace)
         )
         assert 0 < difference < bound
+
+
+def equal_states(recorded: Trace, other: Trace) -> tuple[int, int]:
+    """Returns how many states of robots were recorded, and how many of them are the same in another trace, bit for bit."""
+    same = 0
+    for robot, times_ns in enumerate(recorded.times_ns):
+        at = np.searchsorted(other.times_ns[robot], times_ns)
+        assert (other.times_ns[robot][at] == times_ns).all()
+        same += int((other.states[robot][at] == recorded.states[robot]).all(axis=1).sum())
+    return sum(map(len, recorded.times_ns)), same
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        (LINKS, "periods.acceleration=0.002", "periods.torque=0.001"),
+        ('timing="time_driven"',),
+        ('links=[{channel="state",delay={min=0.0,max=0.03},loss=0.1,policy="hold_then_stop",timeout=0.04}]',),
+    ],
+    ids=["ideal links", "short periods", "time-driven", "delay and loss"],
+)
+@pytest.mark.parametrize("busy", [False, True], ids=["", "busy"])
+def test_virtual_time_with_the_latencies_of_a_wall_clock_is_that_run(
+    overrides: tuple[str, ...], busy: bool, tmp_path: Path
+) -> None:
+    """However late messages and processes were: the states are those of the run, bit for bit."""
+    plan = plan_of("lab", "duration=0.7", *overrides)
+    others = [Process(target=_spin, daemon=True) for _ in range(2 * busy)]
+    for other in others:
+        other.start()
+    try:
+        outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
+    finally:
+        for other in others:
+            other.kill()
+    assert outcome.failure is None
+    arrivals = read_arrivals(tmp_path / "arrivals.bin", plan)
+    assert not arrivals.damaged
+    assert sorted(arrivals.ends_ns) == [one.index for one in plan.formation]
+    recorded, same = equal_states(outcome.trace, trace_of(with_traces(plan, arrivals)))
+    assert recorded == same > 300
+    assert equal_states(outcome.trace, trace_of(plan))[1] < same  # without these latencies it is another run
+
+
+def test_the_arrivals_at_a_member_that_is_killed_are_kept(tmp_path: Path) -> None:
+    plan, killed = plan_of("lab", "duration=100.0"), list[int]()
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns > 700_000_000 and not killed:
+            killed.append(pid_of("g2/r5", descendants(os.getpid())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    outcome = Supervisor(plan, tmp_path, run="wall", virtual=False, show=watch).run()
+    assert outcome.failure is not None
+    assert "lost robot g2/r5" in outcome.failure
+    arrivals = read_arrivals(tmp_path / "arrivals.bin", plan)
+    index = next(robot.index for robot in plan.robots if robot.name == "g2/r5")
+    assert sorted({*range(13)} - set(arrivals.ends_ns)) == [index]
+    assert 0 < arrivals.known_until_ns(index) < plan.duration_ns
 
 
 def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:

@@ -131,7 +131,10 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
     if spec.virtual:
         runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched)
     else:
-        arrivals = ArrivalFile(Path(spec.folder)) if spec.recorded else None
+        try:
+            arrivals = ArrivalFile(Path(spec.folder)) if spec.recorded else None
+        except OSError as error:
+            raise StartError(f"{error.filename}: {error.strerror}") from None
         runner = PacedRunner(role, spec.plan, session, spec.run, watched=spec.watched, arrivals=arrivals)
     role.counts = runner.mailbox.counts
     start_ns = meet(spec, session, control)

@@ -75,7 +75,7 @@ class Kept:
         """Returns the places for a model, in the order in which `Outcomes` takes them."""
         run, marks = model.run[0], r.BLOCK_WHOLES + int(model.run["fractions"][0])
         reals = [at + number for at in model.blocks["measures_at"].tolist() for number in range(r.BLOCK_REALS)]
-        reals += [at + number for at in model.robots["at"].tolist() for number in range(r.S_RIGHT, r.ROBOT_REALS)]
+        reals += [at + number for at in model.robots["at"].tolist() for number in range(r.S_RIGHT, r.A_X)]
         wholes = [at + number for at in model.blocks["marks_at"].tolist() for number in range(marks)]
         wholes += [at + number for at in model.links["marks_at"].tolist() for number in r.COUNTS]
         wholes += [int(run["closest_at"]) + number for number in range(4)]
@@ -93,7 +93,7 @@ def outcomes(
 ) -> BatchRuns:
     """Returns what was measured, from the results `reals` and `wholes` of each run (`Kept`)."""
     count, common_ns = len(seeds), int(model.run["common_ns"][0])
-    shapes = [(len(plan.blocks), r.BLOCK_REALS), (len(plan.robots), r.ROBOT_REALS - r.S_RIGHT)]
+    shapes = [(len(plan.blocks), r.BLOCK_REALS), (len(plan.robots), r.A_X - r.S_RIGHT)]
     of_blocks, of_robots, distance = _split(reals, shapes)
     shapes = [(len(plan.blocks), r.BLOCK_WHOLES + len(fractions(plan))), (len(plan.links), len(r.COUNTS))]
     marks, of_links, closest = _split(wholes, shapes)

@@ -85,7 +85,8 @@ def read_age_ns(link: Any, time_ns: int, sent_ns: int) -> int:
 
 @compiled
 def take_up(link: Any, index: Any, whole: Any) -> None:
-    """Draws what becomes of the messages that were sent since the last call."""
+    """Draws what becomes of the messages that were sent since the last call.  Those that arrive after the run are not kept, so
+    that a heavy tail costs nothing."""
     if link.prompt:
         return
     marks = link.marks_at
@@ -103,6 +104,10 @@ def take_up(link: Any, index: Any, whole: Any) -> None:
             whole[copies + slot] = max(sent_ns + second, whole[marks + LATEST]) if link.fifo else sent_ns + second
         if first != GONE:
             whole[marks + LATEST] = whole[arrivals + slot]
+        if whole[arrivals + slot] > link.end_ns:
+            whole[arrivals + slot] = GONE
+        if whole[copies + slot] > link.end_ns:
+            whole[copies + slot] = GONE
         number += 1
     whole[marks + TAKEN] = number
 

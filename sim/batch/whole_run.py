@@ -4,10 +4,13 @@ from math import cos, isfinite, sin
 from typing import Any, Final
 
 from echelon.sim.batch.compiled import compiled, is_kept
+from echelon.sim.batch.late_states import begin_commands
 from echelon.sim.batch.measures import measure
 from echelon.sim.batch.motion import move
 from echelon.sim.batch.node import gather, steer
 from echelon.sim.batch.records import (
+    A_X,
+    A_Y,
     COS,
     FAR,
     HELD_S,
@@ -100,11 +103,11 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
         if robot.on_arrival:
             change = change_ns(link, whole, now_ns)
             until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
-        if said < 0:
-            move(robot, real, now_ns, until_ns, 0.0, 0.0, False)
-        else:
-            at = said + robot.command
-            move(robot, real, now_ns, until_ns, real[at], real[at + 1], True)
+        ax = ay = 0.0
+        if said >= 0:
+            ax, ay = real[said + robot.command], real[said + robot.command + 1]
+        move(robot, real, now_ns, until_ns, ax, ay, said >= 0)
+        real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
         now_ns = until_ns
 
 
@@ -136,8 +139,9 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
     real[run.distance_at] = 1e300
     for place in range(len(robots)):
         whole[run.order_at + place] = place
-    if run.avoidance:
-        for number in range(len(nodes)):
+    for number in range(len(nodes)):
+        begin_commands(nodes[number], whole)
+        if run.avoidance:
             for place in range(nodes[number].robots):
                 whole[nodes[number].order_at + place] = place
 
@@ -152,6 +156,9 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
     real[place + 1] = real[at + Y]
     real[place + 2] = v * c - across * s
     real[place + 3] = v * s + across * c
+    if stream.length > 4:
+        real[place + 4] = real[at + A_X]
+        real[place + 5] = real[at + A_Y]
     say(stream, whole, time_ns, 0)
     total = real[place] + real[place + 1] + real[place + 2] + real[place + 3] + real[at + THETA]
     total += real[at + OMEGA] + real[at + P_RIGHT] + real[at + P_LEFT] + real[at + P_PEAK]

@@ -20,7 +20,7 @@ import numba
 
 from echelon.controller.laws import terminal_sliding
 from echelon.plan import delay_tables
-from echelon.runtime import fates
+from echelon.runtime import ages, fates
 
 _compiler: Any = numba  # without types: what there is of them changes from version to version
 P = ParamSpec("P")
@@ -62,7 +62,7 @@ def is_kept() -> bool:
 
 def sources() -> list[Path]:
     """Returns the sources of the compiled code: this room, and modules whose numbers are compiled into it."""
-    modules = terminal_sliding, delay_tables, fates
+    modules = terminal_sliding, delay_tables, ages, fates
     return [*sorted(Path(__file__).parent.glob("*.py")), *(Path(module.__file__ or "") for module in modules)]
 
 

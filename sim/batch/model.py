@@ -15,6 +15,7 @@ from echelon.controller.transformation import desired_shape
 from echelon.messages import Channel
 from echelon.plan.layout import NodeLayout, acceleration_of, length
 from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, RobotPlan
+from echelon.runtime.ages import EXACT
 from echelon.sim.batch import records as r
 from echelon.sim.batch.links import fates_of
 from echelon.sim.batch.outcomes import fractions
@@ -113,6 +114,7 @@ class ModelMaker:
             "zeros_at": pools.real(stream["length"]) if link.policy == "zero" else -1,
             "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
         } | fates_of(link, pools)
+        record |= self._ages(link)
         for number, (first, count) in enumerate(parts, start=1):
             record |= {f"first_{number}": first, f"size_{number}": count}
         return record
@@ -123,6 +125,22 @@ class ModelMaker:
             return r.AS_THEY_ARE
         otherwise = r.WITH_REFERENCE if self.plan.reference == "message" else r.AS_THEY_ARE
         return {EXTRAPOLATE: r.EXTRAPOLATED, PREDICT: r.PREDICTED}.get(link.policy, otherwise)
+
+    def _ages(self, link: LinkPlan) -> dict[str, int]:
+        """Returns where the ages of a link's messages are counted."""
+        pools, duration_ns, receiver = self.pools, self.plan.duration_ns, self.plan.formation[link.receiver]
+        acts_late = receiver.event_driven and not all(each.prompt for each in self.plan.links_into(link.receiver))
+        if link.prompt and not acts_late:
+            most = link.period_ns // gcd(link.period_ns, receiver.period_ns) - 1
+        else:  # once in each period of the receiver, and when a message arrives or becomes too old
+            most = duration_ns // receiver.period_ns + 3 * (duration_ns // link.period_ns) + 4
+        few = min(most, EXACT + 1)
+        slots = 1 << (few + few // 2).bit_length()
+        return {
+            "ages_at": pools.whole(2 * slots if most else 0),
+            "ages_mask": slots - 1,
+            "bins_at": pools.whole(duration_ns.bit_length() << 7 if most > EXACT else 0),
+        }
 
     def _parts(self, at: int) -> list[tuple[int, int]]:
         """Returns what a receiver uses of the messages of a link: places and lengths."""

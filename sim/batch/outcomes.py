@@ -31,7 +31,7 @@ ROBOT_FIELDS: Final = np.dtype(
 )
 LINK_FIELDS: Final = np.dtype(
     [(name, "i8") for name in ("sent", "delivered", "lost", "in_flight", "duplicates", "used", "held")]
-    + [(name, "f8") for name in ("age_mean", "age_max")]
+    + [(name, "f8") for name in ("age_mean", "age_p50", "age_p95", "age_p99", "age_max")]
 )
 
 
@@ -201,7 +201,7 @@ def _robots(plan: Plan, of_robots: NDArray[np.float64]) -> Records:
 
 
 def _links(plan: Plan, of_links: NDArray[np.int64]) -> Records:
-    sent, delivered, lost, duplicates, used, held, age_sum, age_max = np.moveaxis(of_links, 2, 0)
+    sent, delivered, lost, duplicates, used, held, age_sum, age_max, *percentiles = np.moveaxis(of_links, 2, 0)
     prompt = np.array([link.prompt for link in plan.links], dtype=bool)
     links = np.zeros(sent.shape, dtype=LINK_FIELDS)
     links["sent"], links["lost"], links["used"], links["held"] = sent, lost, used, held
@@ -209,5 +209,6 @@ def _links(plan: Plan, of_links: NDArray[np.int64]) -> Records:
     links["delivered"] = np.where(prompt, sent, delivered)
     links["in_flight"] = sent - lost - links["delivered"]
     links["age_mean"] = np.where(used > 0, age_sum / np.maximum(used, 1) / 1e9, np.nan)
-    links["age_max"] = np.where(used > 0, age_max / 1e9, np.nan)
+    for name, age_ns in zip(("age_max", "age_p50", "age_p95", "age_p99"), (age_max, *percentiles), strict=True):
+        links[name] = np.where(used > 0, age_ns / 1e9, np.nan)
     return links

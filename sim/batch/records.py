@@ -73,6 +73,8 @@ LINK: Final = _record(
     "length mask stream_at stream_marks_at prompt timeout_ns end_ns at zeros_at marks_at "
     # how a late state is brought to the present (below), and whether it is a robot's
     "brought of_robot "
+    # ages of what is used: pairs and bins in `whole` (ages)
+    "ages_at ages_mask bins_at "
     "first_1 size_1 first_2 size_2 first_3 size_3 "
     # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
     "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
@@ -112,9 +114,12 @@ TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, DUPLICATES, USED, HELD, AG
 NEXT, NEWEST, OLDEST, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 22)
 F_OWN, F_LOSS, F_COPY, F_BURST = 22, 26, 30, 34
 """Draws of two messages"""
-LINK_WHOLES: Final = 38
+AGED, AGES, AGE_P50, AGE_P95, AGE_P99 = range(38, 43)
+"""Uses of messages older than the instant; number of their different ages, -1 once there are too many to count them one by one;
+percentiles (ages)"""
+LINK_WHOLES: Final = 43
 """After these come the arrivals of the messages in flight [ns], then those of their second copies"""
-COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX)
+COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX, AGE_P50, AGE_P95, AGE_P99)
 """What of these is a result"""
 GONE: Final = -1
 """Arrival of a message that was delivered or lost"""

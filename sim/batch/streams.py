@@ -3,6 +3,7 @@
 
 from typing import Any
 
+from echelon.sim.batch.ages import note_age
 from echelon.sim.batch.compiled import compiled
 from echelon.sim.batch.fates import fates, rounded
 from echelon.sim.batch.records import (
@@ -72,6 +73,7 @@ def hear(link: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
         whole[marks + AGE_SUM] += age
         if age > whole[marks + AGE_MAX]:
             whole[marks + AGE_MAX] = age
+        note_age(link, whole, age)
     whole[marks + LAST] = number
     return int(place)
 

@@ -3,6 +3,7 @@
 from math import cos, isfinite, sin
 from typing import Any, Final
 
+from echelon.sim.batch.ages import find_percentiles
 from echelon.sim.batch.compiled import compiled, is_kept
 from echelon.sim.batch.late_states import begin_commands
 from echelon.sim.batch.measures import measure
@@ -184,6 +185,8 @@ def many_runs(
     `wholes[number]`."""
     for number in range(first, last):
         lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)])
+        for at in range(len(model.links)):
+            find_percentiles(model.links[at], whole)
         for place in range(len(kept_reals)):
             reals[number, place] = real[kept_reals[place]]
         for place in range(len(kept_wholes)):

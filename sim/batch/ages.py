@@ -23,7 +23,7 @@ _GAPS: Final = (701, 301, 132, 57, 23, 10, 4, 1)
 @compiled
 def bin_of(age_ns: int) -> int:
     """Returns the number of the bin of an age: those with the same leading bits."""
-    return (np.float64(age_ns).view(np.int64) >> _DROPPED) - _ONE
+    return int((np.float64(age_ns).view(np.int64) >> _DROPPED) - _ONE)
 
 
 @compiled

@@ -56,6 +56,11 @@ class BatchRuns:
     """(T,): instants of the traces [s]"""
     traces: NDArray[np.float64] | None
     """(R, T, robots, len(TRACED)): states at the instants that all robots share; None if they were not asked for"""
+    mean_squares: NDArray[np.float64] | None
+    """(T, blocks): E|e|², the mean over the runs of the squared error of each block [m²], infinite once a run has diverged; None if it was not asked for.  Where E|e|² grows though most runs settle, a few runs make most of
+    the mean: it takes many runs"""
+    mean_squares_error: NDArray[np.float64] | None
+    """(T, blocks): standard error of this mean [m²]; NaN with one run, and where the mean is infinite"""
 
 
 def fractions(plan: Plan) -> tuple[float, ...]:
@@ -90,8 +95,10 @@ def outcomes(
     reals: NDArray[np.float64],
     wholes: NDArray[np.int64],
     traces: NDArray[np.float64] | None,
+    sums: NDArray[np.float64] | None,
 ) -> BatchRuns:
-    """Returns what was measured, from the results `reals` and `wholes` of each run (`Kept`)."""
+    """Returns what was measured, from the results `reals` and `wholes` of each run (`Kept`), and from the sums of |e|² and of
+    |e|⁴ over the runs, (T, blocks, 2)."""
     count, common_ns = len(seeds), int(model.run["common_ns"][0])
     shapes = [(len(plan.blocks), r.BLOCK_REALS), (len(plan.robots), r.A_X - r.S_RIGHT)]
     of_blocks, of_robots, distance = _split(reals, shapes)
@@ -114,7 +121,15 @@ def outcomes(
         settling.claims(),
         np.arange(0, plan.duration_ns + 1, common_ns) / 1e9,
         traces,
+        *((None, None) if sums is None else _means(sums, count)),
     )
+
+
+def _means(sums: NDArray[np.float64], runs: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns mean and standard error, from the sums of a number of values and of their squares."""
+    mean, square = np.moveaxis(sums, -1, 0) / runs
+    with np.errstate(all="ignore"):
+        return mean, _finite(np.sqrt(np.maximum(square - np.square(mean), 0.0) / (runs - 1)))
 
 
 def _split(values: NDArray[Any], shapes: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:

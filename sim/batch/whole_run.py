@@ -1,6 +1,6 @@
 """One whole run, and many of them: what a thread of the batch engine does."""
 
-from math import cos, isfinite, sin
+from math import cos, inf, isfinite, sin
 from typing import Any, Final
 
 from echelon.sim.batch.ages import find_percentiles
@@ -19,6 +19,7 @@ from echelon.sim.batch.records import (
     KEY_0,
     LAST,
     M_FINITE,
+    M_LAST,
     NEWEST,
     NEXT,
     OMEGA,
@@ -48,12 +49,13 @@ __all__ = ["is_kept", "many_runs", "whole_run"]
 
 
 @compiled
-def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
+def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any, sums: Any) -> int:
     """Runs a plan; returns the instant at which a robot's state is not finite [ns], or -1.  What is measured is in `real` and
     `whole` then.
 
     `keys`: two Philox keys of each link, (links, 4), the bits of its words as integers.  `trace`: states of the robots at the
-    instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted."""
+    instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted.  `sums`: |e|² and |e|⁴ of each block are
+    added to it, (T, blocks, 2), or (0, blocks, 2)."""
     run = model.run[0]
     robots, nodes, blocks, streams, links = model.robots, model.nodes, model.blocks, model.streams, model.links
     table, index = model.table, model.indices
@@ -74,8 +76,13 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
                 for number in range(len(robots)):
                     for value in range(7):
                         trace[instant, number, value] = real[robots[number].at + value]
+            if len(sums) > instant:
+                _add_squares(blocks, real, sums, instant)
             instant += 1
         if lost_ns >= 0:
+            for later in range(instant, len(sums)):
+                for number in range(len(blocks)):
+                    sums[later, number, 0] = sums[later, number, 1] = inf
             return lost_ns
         for number in range(len(nodes)):
             node = nodes[number]
@@ -93,6 +100,17 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
                 _obey(run, robot, links[robot.link], index, real, whole, time_ns)
                 whole[run.due_at + number] += robot.period_ns
     return lost_ns
+
+
+@compiled
+def _add_squares(blocks: Any, real: Any, sums: Any, instant: int) -> None:
+    """Adds |e|² and |e|⁴ of each block; infinity for what is not finite."""
+    for number in range(len(blocks)):
+        square = real[blocks[number].measures_at + M_LAST] ** 2
+        if not isfinite(square):
+            square = inf
+        sums[instant, number, 0] += square
+        sums[instant, number, 1] += square * square
 
 
 @compiled
@@ -178,13 +196,13 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
 
 @compiled
 def many_runs(
-    model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, traces: Any, lost_ns: Any,
+    model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, traces: Any, sums: Any, lost_ns: Any,
     kept_reals: Any, kept_wholes: Any, reals: Any, wholes: Any,
 ) -> None:  # fmt: skip
     """Runs number `first` to `last` - 1; copies the results of each from the scratch (`real`, `whole`) to `reals[number]` and
     `wholes[number]`."""
     for number in range(first, last):
-        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)])
+        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)], sums)
         for at in range(len(model.links)):
             find_percentiles(model.links[at], whole)
         for place in range(len(kept_reals)):

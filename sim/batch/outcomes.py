@@ -57,8 +57,9 @@ class BatchRuns:
     traces: NDArray[np.float64] | None
     """(R, T, robots, len(TRACED)): states at the instants that all robots share; None if they were not asked for"""
     mean_squares: NDArray[np.float64] | None
-    """(T, blocks): E|e|², the mean over the runs of the squared error of each block [m²], infinite once a run has diverged; None if it was not asked for.  Where E|e|² grows though most runs settle, a few runs make most of
-    the mean: it takes many runs"""
+    """(T, blocks): E|e|², the mean over the runs of the squared error of each block [m²], infinite once a run has diverged;
+    None if it was not asked for.  Where E|e|² grows though most runs settle, a few runs make most of the mean; then it takes
+    many runs, and the standard error is too small with few"""
     mean_squares_error: NDArray[np.float64] | None
     """(T, blocks): standard error of this mean [m²]; NaN with one run, and where the mean is infinite"""
 

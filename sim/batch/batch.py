@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
@@ -19,8 +20,8 @@ from echelon.sim.batch.refusals import refusal
 _WORD: Final = 2**64 - 1
 MOST_AT_ONCE: Final = 16
 """Largest number of runs that a thread takes at once"""
-PARTS: Final = 64
-"""Number of parts into which runs are divided at least.  Parts do not depend on threads, and neither do sums over runs."""
+PARTS: Final = 16
+"""Parts into which runs are divided at least if something is summed over runs.  They do not depend on threads, nor do sums"""
 
 
 def run_many(
@@ -60,17 +61,33 @@ def run_many(
     sums_of = instants if mean_squares else 0, len(plan.blocks), 2
     sums = np.zeros(sums_of)
 
+    own = threading.local()
+
     def work(part: range) -> tuple[int, NDArray[np.float64]]:
         added = np.zeros(sums_of)
-        scratch = np.empty(pools.reals), np.empty(pools.wholes, dtype=np.int64)
+        if not hasattr(own, "scratch"):
+            own.scratch = np.empty(pools.reals), np.empty(pools.wholes, dtype=np.int64)
+        real, whole = own.scratch
         whole_run.many_runs(
-            model, keys, part.start, part.stop, *scratch, traced, added, lost_ns, kept.reals, kept.wholes, reals, wholes
+            model,
+            keys,
+            part.start,
+            part.stop,
+            real,
+            whole,
+            traced,
+            added,
+            lost_ns,
+            kept.reals,
+            kept.wholes,
+            reals,
+            wholes,
         )
         return len(part), added
 
     work(range(0))
     count = threads or len(os.sched_getaffinity(0))
-    size = max(1, min(MOST_AT_ONCE, len(seeds) // PARTS))
+    size = max(1, min(MOST_AT_ONCE, len(seeds) // (PARTS if mean_squares else 4 * count)))
     parts = [range(first, min(first + size, len(seeds))) for first in range(0, len(seeds), size)]
     pool, done = ThreadPoolExecutor(count), 0
     try:

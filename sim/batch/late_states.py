@@ -46,22 +46,23 @@ def note_commands(node: Any, real: Any, whole: Any, time_ns: int, commanded: boo
 @fused
 def bring(
     node: Any, run: Any, link: Any, table: Any, index: Any, real: Any, whole: Any, child: int, said: int, time_ns: int,
-    since_ns: int,
+    since_ns: int, now_x: float, now_y: float, now_vx: float, now_vy: float,
 ) -> None:  # fmt: skip
-    """Moves a child's state, which was said at `said` in `real`, from `since_ns` on to `time_ns`, by the policy of its link."""
+    """Moves a child's state, which was said at `said` in `real`, from `since_ns` on to `time_ns`, by the policy of its link.
+
+    `now_x` to `now_vy`: the reference and its velocity at `time_ns`, if it is moved on as the reference has moved."""
     at, tau = node.s_at + 4 * child, (time_ns - since_ns) * 1e-9
-    x, y, vx, vy = real[at], real[at + 1], real[at + 2], real[at + 3]
+    before_x, before_y = real[at], real[at + 1]
     if link.brought == PREDICTED:
         _replay(node, index, real, whole, child, time_ns, since_ns)
     elif link.brought == EXTRAPOLATED:
         a = said + 4 if link.of_robot else _last_command(node, real, whole, child)
         ax, ay = real[a], real[a + 1]
-        real[at] += vx * tau + ax * (tau * tau / 2)
-        real[at + 1] += vy * tau + ay * (tau * tau / 2)
+        real[at] += real[at + 2] * tau + ax * (tau * tau / 2)
+        real[at + 1] += real[at + 3] * tau + ay * (tau * tau / 2)
         real[at + 2] += ax * tau
         real[at + 3] += ay * tau
     else:
-        now_x, now_y, now_vx, now_vy, _, _ = desired(run, table, max(0, time_ns) * 1e-9)
         then_x, then_y, then_vx, then_vy, _, _ = desired(run, table, max(0, since_ns) * 1e-9)
         real[at] += now_x - then_x
         real[at + 1] += now_y - then_y
@@ -69,7 +70,7 @@ def bring(
         real[at + 3] += now_vy - then_vy
     if not run.avoidance:
         return
-    x, y = real[at] - x, real[at + 1] - y
+    x, y = real[at] - before_x, real[at + 1] - before_y
     for part in range(index[node.carried_at + child], index[node.carried_at + child + 1]):
         here, size = index[3 * part + 1], index[3 * part + 2]
         if here >= node.positions:

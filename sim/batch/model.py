@@ -110,6 +110,7 @@ class ModelMaker:
             "end_ns": plan.duration_ns,
             "at": pools.real(size - shift) - shift,
             "brought": self._brought(link),
+            "odd_clocks": not link.clocks_are_true,
             "of_robot": link.channel is Channel.STATE,
             "zeros_at": pools.real(stream["length"]) if link.policy == "zero" else -1,
             "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
@@ -130,16 +131,15 @@ class ModelMaker:
         """Returns where the ages of a link's messages are counted."""
         pools, duration_ns, receiver = self.pools, self.plan.duration_ns, self.plan.formation[link.receiver]
         acts_late = receiver.event_driven and not all(each.prompt for each in self.plan.links_into(link.receiver))
-        if link.prompt and not acts_late:
-            most = link.period_ns // gcd(link.period_ns, receiver.period_ns) - 1
-        else:  # once in each period of the receiver, and when a message arrives or becomes too old
-            most = duration_ns // receiver.period_ns + 3 * (duration_ns // link.period_ns) + 4
-        few = min(most, EXACT + 1)
-        slots = 1 << (few + few // 2).bit_length()
+        # A message is used once in each period of the receiver, and when it arrives or becomes too old.
+        most = duration_ns // receiver.period_ns + 3 * (duration_ns // link.period_ns) + 4
+        if link.prompt and not acts_late and receiver.period_ns % link.period_ns == 0:
+            most = 0  # it is always new
+        many = most > EXACT
         return {
-            "ages_at": pools.whole(2 * slots if most else 0),
-            "ages_mask": slots - 1,
-            "bins_at": pools.whole(duration_ns.bit_length() << 7 if most > EXACT else 0),
+            "ages_at": pools.whole(min(most, r.LISTED)),
+            "uses_at": pools.whole(EXACT if many else 0),
+            "bins_at": pools.whole(duration_ns.bit_length() << 7 if many else 0),
         }
 
     def _parts(self, at: int) -> list[tuple[int, int]]:
@@ -306,6 +306,7 @@ class ModelMaker:
             "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),
             "closest_at": pools.whole(4),
+            "slots_at": pools.whole(r.SLOTS),
             "avoidance_radius": avoidance.avoidance_radius,
             "sensing_radius": avoidance.sensing_radius,
             "force_limit": avoidance.force_limit,

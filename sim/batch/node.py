@@ -6,7 +6,7 @@ from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.late_states import bring, note_commands
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.potential import add_pair_forces
-from echelon.sim.batch.records import STAMP
+from echelon.sim.batch.records import STAMP, WITH_REFERENCE
 from echelon.sim.batch.streams import hear, heard_ns, read_age_ns, room, say, take_up
 
 
@@ -27,9 +27,11 @@ def gather(
             time_ns = heard_ns(links[index[node.links_at + child]], whole, time_ns, last_ns)
     whole[node.acted_at] = time_ns
     complete = 1
+    x = y = vx = vy = 0.0
+    is_known = False  # the reference at `time_ns`
     for child in range(count):
         link = links[index[node.links_at + child]]
-        said = hear(link, index, real, whole, time_ns)
+        said = hear(link, run, index, real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -40,9 +42,14 @@ def gather(
             for value in range(size):
                 real[node.state_at + here + value] = real[said + there + value]
         if link.brought:
-            age_ns = read_age_ns(link, time_ns, whole[link.marks_at + STAMP])
-            if age_ns != 0:
-                bring(node, run, link, table, index, real, whole, child, said, time_ns, time_ns - age_ns)
+            since_ns = whole[link.marks_at + STAMP]
+            if link.odd_clocks:
+                since_ns = time_ns - read_age_ns(link, time_ns, since_ns)
+            if since_ns != time_ns:
+                if link.brought == WITH_REFERENCE and not is_known:
+                    x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
+                    is_known = True
+                bring(node, run, link, table, index, real, whole, child, said, time_ns, since_ns, x, y, vx, vy)
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -108,7 +115,7 @@ def steer(
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
-        said = hear(links[node.link], index, real, whole, time_ns)
+        said = hear(links[node.link], run, index, real, whole, time_ns)
         if said < 0:
             complete = 0
         else:

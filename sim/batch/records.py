@@ -24,8 +24,9 @@ RUN: Final = _record(
     # instants [ns]; whether robots avoid each other; law and trajectory (below), the trajectory's numbers in `table`
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
     # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and those of robots before, and their
-    # order (potential); square of the smallest distance; the pair and its instant, then the number of violations
-    "due_at places_at before_at order_at distance_at closest_at",
+    # order (potential); square of the smallest distance; the pair and its instant, then the number of violations; a hash table
+    # (ages)
+    "due_at places_at before_at order_at distance_at closest_at slots_at",
     # `ahead`: how far the feed-forward is led [s]
     "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead",
 )
@@ -71,10 +72,10 @@ LINK: Final = _record(
     # its stream, as above; `at`: the message in use in `real`, `zeros_at`: what is used where it is too old (policy `zero`);
     # places and sizes of the parts that the receiver uses of a message
     "length mask stream_at stream_marks_at prompt timeout_ns end_ns at zeros_at marks_at "
-    # how a late state is brought to the present (below), and whether it is a robot's
-    "brought of_robot "
-    # ages of what is used: pairs and bins in `whole` (ages)
-    "ages_at ages_mask bins_at "
+    # how a late state is brought to the present (below), whether it is a robot's, whether clocks are wrong
+    "brought of_robot odd_clocks "
+    # ages of what is used: list, numbers of uses and bins in `whole` (ages)
+    "ages_at uses_at bins_at "
     "first_1 size_1 first_2 size_2 first_3 size_3 "
     # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
     "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
@@ -115,8 +116,12 @@ NEXT, NEWEST, OLDEST, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 22)
 F_OWN, F_LOSS, F_COPY, F_BURST = 22, 26, 30, 34
 """Draws of two messages"""
 AGED, AGES, AGE_P50, AGE_P95, AGE_P99 = range(38, 43)
-"""Uses of messages older than the instant; number of their different ages, -1 once there are too many to count them one by one;
-percentiles (ages)"""
+"""Uses of messages older than the instant; number of their different ages once they are counted one by one, -1 if there are too
+many; percentiles (ages)"""
+LISTED: Final = 2048
+"""Length of a list of ages"""
+SLOTS: Final = 2048
+"""Size of the hash table of ages"""
 LINK_WHOLES: Final = 43
 """After these come the arrivals of the messages in flight [ns], then those of their second copies"""
 COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX, AGE_P50, AGE_P95, AGE_P99)

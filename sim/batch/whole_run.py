@@ -118,7 +118,7 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
     """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
     now_ns, end_ns = due_ns, due_ns + robot.period_ns
     while now_ns < end_ns:
-        said, until_ns = hear(link, index, real, whole, now_ns), end_ns
+        said, until_ns = hear(link, run, index, real, whole, now_ns), end_ns
         if robot.on_arrival:
             change = change_ns(link, whole, now_ns)
             until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
@@ -204,7 +204,7 @@ def many_runs(
     for number in range(first, last):
         lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)], sums)
         for at in range(len(model.links)):
-            find_percentiles(model.links[at], whole)
+            find_percentiles(model.links[at], model.run[0], whole)
         for place in range(len(kept_reals)):
             reals[number, place] = real[kept_reals[place]]
         for place in range(len(kept_wholes)):

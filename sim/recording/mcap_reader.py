@@ -22,6 +22,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from echelon.large_arrays import Rows, RowsInFile
 from echelon.messages import STATE_FIELDS, TORQUE_FIELDS
 from echelon.messages import Channel as MessageChannel
 from echelon.plan.plan import Plan
@@ -69,8 +70,8 @@ def read_trace(path: Path, plan: Plan) -> Trace:
     Raises ValueError if the file is cut off, damaged, not a recording, or a recording of another plan."""
     topics = [state_topic(robot.path) for robot in plan.robots]
     with blame(path):
-        times_ns, states = _by_robot(path, topics, "RobotState", ros.robot_state(), len(STATE_FIELDS))
-        return Trace(plan, times_ns, states)
+        rows = Rows([plan.duration_ns // robot.period_ns + 1 for robot in plan.robots], len(STATE_FIELDS))
+        return Trace(plan, *_by_robot(path, topics, "RobotState", ros.robot_state(), rows))
 
 
 def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
@@ -80,30 +81,27 @@ def read_torques(path: Path, plan: Plan) -> list[tuple[NDArray[np.int64], NDArra
     Raises ValueError if the file is cut off, damaged, not a recording, or a recording of another plan."""
     topics = [torque_topic(robot.path) for robot in plan.robots]
     with blame(path):
-        times_ns, torques = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), len(TORQUE_FIELDS))
+        rows = Rows([plan.duration_ns // robot.torque_period_ns + 1 for robot in plan.robots], len(TORQUE_FIELDS))
+        times_ns, torques, _ = _by_robot(path, topics, "WheelTorque", ros.wheel_torque(), rows)
         return list(zip(times_ns, torques, strict=True))
 
 
 def _by_robot(
-    path: Path, topics: Sequence[str], kind: str, splice: ros.Splice, width: int
-) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.float64], ...]]:
-    """Returns for each topic the instants [ns], (T,), and the values, (T, `width`), of its messages.
+    path: Path, topics: Sequence[str], kind: str, splice: ros.Splice, rows: Rows
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.float64], ...], RowsInFile | None]:
+    """Returns what `rows` builds from the messages on the topics, which are by robot.
 
-    `topics` are by robot; `kind` is the type of the messages in echelon_msgs, and `splice` its encoder."""
+    `kind` is the type of the messages in echelon_msgs, and `splice` its encoder."""
     robots = {topic: robot for robot, topic in enumerate(topics)}
     prefix = len(splice.encode(ros.stamp(0), b""))
-    times: list[list[int]] = [[] for _ in topics]
-    values: list[list[bytes]] = [[] for _ in topics]
+    size = prefix + 8 * rows.width
     for topic, time_ns, data in _messages(path, robots, f"echelon_msgs/{kind}"):
-        if len(data) != prefix + 8 * width:
-            raise ValueError(f"a {kind} of {topic} has {len(data)} bytes, not {prefix + 8 * width}")
-        robot = robots[topic]
-        times[robot].append(time_ns)
-        values[robot].append(data[prefix:])
-    return (
-        tuple(np.array(row, np.int64) for row in times),
-        tuple(np.frombuffer(b"".join(row), "<f8").reshape(-1, width) for row in values),
-    )
+        if len(data) != size:
+            raise ValueError(f"a {kind} of {topic} has {len(data)} bytes, not {size}")
+        rows.add(robots[topic], time_ns, data[prefix:])
+        if rows.surplus:
+            raise ValueError(f"{topic} has more messages than there are instants in the plan")
+    return rows.build()
 
 
 def read_links(path: Path) -> list[tuple[int, LinkCounts]]:

@@ -77,7 +77,7 @@ def longest(times: Sequence[TimeAxis]) -> TimeAxis:
 
 
 def _paths(runs: Sequence[Compared]) -> Picture:
-    places = [drawable(run.trace.common()[1][:, :, [X, Y]]) for run in runs]
+    places = [drawable(run.trace.common((X, Y))[1]) for run in runs]
     shown = np.concatenate([place.reshape(-1, 1, 2) for place in places])
 
     def draw(figure: Figure) -> None:

@@ -21,8 +21,8 @@ X, Y, THETA = field_index(STATE_FIELDS, "x", "y", "theta")
 def trajectories(trace: Trace, width: float) -> Picture:
     """Draws a map like the paper's Figs. 2 and 3: the paths of all robots, triangles that point in heading direction at their
     start and end, the outline of each group at the end, and the desired and the real path of the centroid."""
-    times_ns, states = trace.common()
-    plan, place = trace.plan, drawable(states[:, :, [X, Y]])
+    times_ns, states = trace.common((X, Y, THETA))
+    plan, place = trace.plan, drawable(states[:, :, :2])
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -37,7 +37,7 @@ def trajectories(trace: Trace, width: float) -> Picture:
                 path = place[:, robot.index]
                 axes.plot(*path.T, color=look.colour, ls=look.dashes, lw=0.9, alpha=0.85, zorder=4)
                 for at, filled in ((0, False), (-1, True)):
-                    _robot(axes, path[at], states[at, robot.index, THETA], size, look.colour, filled)
+                    _robot(axes, path[at], states[at, robot.index, 2], size, look.colour, filled)
             for number, (name, robots) in enumerate(_groups(plan)):
                 corners = place[-1, robots]
                 if np.isfinite(corners).all():

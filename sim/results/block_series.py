@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.controller.transformation import Transformation
+from echelon.large_arrays import large_empty
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan.plan import BlockPlan
 from echelon.sim.results.desired import Desired
@@ -53,27 +54,30 @@ def block_series(trace: Trace) -> Blocks:
     """Returns all blocks at the instants at which every robot has a state.
 
     A state that is not finite gives values that are not finite, without an exception or a warning."""
-    times_ns, states = trace.common()
-    plan = trace.plan
-    transformation = Transformation(plan)
+    times_ns, plan = trace.common_ns(), trace.plan
+    transformation, reference = Transformation(plan), Desired(plan)
     instants, size = len(times_ns), 2 * len(plan.robots)
-    reference = Desired(plan).sample(times_ns / 1e9)
-    desired = np.empty((instants, size))
+    value, desired, error, rate, error_rate = (large_empty((instants, size)) for _ in range(5))
     desired[:, :-2] = transformation.desired_shape.reshape(-1)
-    desired[:, -2:] = reference[:, 0]
-    desired_rate = np.zeros((instants, size))
-    desired_rate[:, -2:] = reference[:, 1]
+    norms = [large_empty(instants) for _ in plan.blocks]
     with np.errstate(all="ignore"):
-        value = _transformed(transformation, states[:, :, POSITION]).reshape(instants, size)
-        rate = _transformed(transformation, states[:, :, VELOCITY]).reshape(instants, size)
-        error, error_rate = value - desired, rate - desired_rate
-        series = []
-        for block in plan.blocks:
-            at = slice(block.offset, block.offset + block.size)
-            norm = np.sqrt(np.square(error[:, at]).sum(axis=1))
-            series.append(
-                BlockSeries(block, value[:, at], desired[:, at], error[:, at], rate[:, at], error_rate[:, at], norm)
-            )
+        for part, states in trace.windows((*POSITION, *VELOCITY)):
+            value[part] = _transformed(transformation, states[:, :, :2]).reshape(-1, size)
+            rate[part] = _transformed(transformation, states[:, :, 2:]).reshape(-1, size)
+            wanted = reference.sample(times_ns[part] / 1e9)
+            desired[part, -2:] = wanted[:, 0]
+            np.subtract(value[part], desired[part], out=error[part])
+            error_rate[part] = rate[part]
+            error_rate[part, -2:] -= wanted[:, 1]
+            for block, norm in zip(plan.blocks, norms, strict=True):
+                of_block = error[part, block.offset : block.offset + block.size]
+                np.sqrt(np.square(of_block).sum(axis=1), out=norm[part])
+    series = []
+    for block, norm in zip(plan.blocks, norms, strict=True):
+        at = slice(block.offset, block.offset + block.size)
+        series.append(
+            BlockSeries(block, value[:, at], desired[:, at], error[:, at], rate[:, at], error_rate[:, at], norm)
+        )
     return Blocks(times_ns, tuple(series))
 
 

@@ -6,10 +6,12 @@ least at s = -r0·D / |D|², clipped to [0, 1].  A real path differs from the st
 """
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
+from echelon.large_arrays import large_empty
 from echelon.sim.results.block_series import POSITION
 from echelon.sim.results.trace import Trace
 
@@ -55,27 +57,42 @@ def distances(trace: Trace) -> Distances:
 
     A robot whose position is not finite has no distance to other robots.  A violation is a distance of at most the plan's
     avoidance radius r_a, also where avoidance is not enabled."""
-    times_ns, states = trace.common()
-    x, y = (np.ascontiguousarray(states[:, :, field]) for field in POSITION)
-    instants = len(times_ns)
-    if instants == 1:  # a single instant counts as a motion of length zero
-        times_ns, x, y = np.repeat(times_ns, 2), np.repeat(x, 2, axis=0), np.repeat(y, 2, axis=0)
-    smallest = np.full(len(times_ns), np.nan)
+    times_ns = trace.common_ns()
+    smallest = large_empty(len(times_ns))
+    smallest[:] = np.nan
     closest: Encounter | None = None
-    violations: list[Violation] = []
+    violations: dict[tuple[int, int], list[Violation]] = {}
     radius = trace.plan.avoidance.avoidance_radius
-    with np.errstate(all="ignore"):
-        for one in range(x.shape[1] - 1 if instants else 0):
-            rows = _Pairs.of(x[:, one + 1 :] - x[:, one, None], y[:, one + 1 :] - y[:, one, None])
-            np.fmin(smallest[:-1], np.fmin.reduce(rows.least, axis=1), out=smallest[:-1])
-            smallest[-1] = np.fmin(smallest[-1], np.fmin.reduce(rows.at[-1]))
-            found = rows.closest(one, times_ns)
-            if found is not None and (closest is None or found.distance < closest.distance):
-                closest = found
-            for column in np.flatnonzero((rows.least <= radius).any(axis=0)):
-                violations += rows.violations(one, int(column), times_ns, radius)
-    violations.sort(key=lambda violation: (violation.first_ns, violation.pair))
-    return Distances(times_ns[:instants], smallest[:instants], closest, tuple(violations))
+    for part, places in trace.windows(POSITION, overlap=1):
+        part_ns, (x, y) = times_ns[part], np.ascontiguousarray(places.transpose(2, 0, 1))
+        if len(part_ns) == 1:  # a single instant counts as a motion of length zero
+            part_ns, x, y = np.repeat(part_ns, 2), np.repeat(x, 2, axis=0), np.repeat(y, 2, axis=0)
+        least = smallest[part]
+        with np.errstate(all="ignore"):
+            for one in range(x.shape[1] - 1):
+                rows = _Pairs.of(x[:, one + 1 :] - x[:, one, None], y[:, one + 1 :] - y[:, one, None])
+                np.fmin(least[:-1], np.fmin.reduce(rows.least, axis=1)[: len(least) - 1], out=least[:-1])
+                if part.stop == len(times_ns):
+                    least[-1] = np.fmin(least[-1], np.fmin.reduce(rows.at[-1]))
+                found = rows.closest(one, part_ns)
+                if found is not None and (closest is None or found.distance < closest.distance):
+                    closest = found
+                for column in np.flatnonzero((rows.least <= radius).any(axis=0)).tolist():
+                    earlier = violations.setdefault((one, one + 1 + column), [])
+                    _extend(earlier, rows.violations(one, column, part_ns, radius), rows.at[0, column] <= radius)
+    in_order = sorted(chain.from_iterable(violations.values()), key=lambda found: (found.first_ns, found.pair))
+    return Distances(times_ns, smallest, closest, tuple(in_order))
+
+
+def _extend(violations: list[Violation], later: list[Violation], is_inside: bool) -> None:
+    """Adds the violations of a pair in the next piece of a trace.
+
+    With `is_inside` the pair is within the radius where the pieces meet; a violation that ends there goes on."""
+    if violations and is_inside and violations[-1].last_ns == later[0].first_ns:
+        before, after = violations.pop(), later[0]
+        smallest = min(before.smallest, after.smallest)
+        later = [Violation(before.pair, before.first_ns, after.last_ns, smallest), *later[1:]]
+    violations += later
 
 
 @dataclass(frozen=True, slots=True)

@@ -207,9 +207,9 @@ def torque_result(trace: Trace, robot: int) -> TorqueResult:
     """Returns root mean square, peak and saturation of the wheel torques of a robot (by index) over the run."""
     plan = trace.plan.robots[robot]
     # The state at time 0 is not the result of a period, so it has no torque.
-    began = trace.times_ns[robot] > 0
-    times_ns = trace.times_ns[robot][began]
-    fields = dict(zip(STATE_FIELDS, trace.states[robot][began].T, strict=True))
+    began = int(np.searchsorted(trace.times_ns[robot], 0, side="right"))
+    times_ns = trace.times_ns[robot][began:]
+    fields = dict(zip(STATE_FIELDS, trace.states[robot][began:].T, strict=True))
     peaks = np.stack([fields["tau_right_peak"], fields["tau_left_peak"]])
     peak, peak_wheel, peak_time = 0.0, None, None
     if len(times_ns):

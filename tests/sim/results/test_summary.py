@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from echelon.bridge.reports import BusEvent, BusReport, FindingReport, RefereeReport, ScheduledEvent
+from echelon.sim.results.block_series import block_series
 from echelon.sim.results.can_lines import can_lines, finding_text
 from echelon.sim.results.distances import distances
 from echelon.sim.results.records import Summary
 from echelon.sim.results.rendering import json_text, read_summary, write_summary
 from echelon.sim.results.summary import summarise, summary_text
+from echelon.sim.results.tables import PARTS
 from echelon.sim.results.trace import Trace
 from support.synthetic import (
     DECAY,
@@ -220,6 +222,25 @@ def test_closest_approach_agrees_with_dense_interpolation():
     radius = 0.5
     inside = {(i, j) for i in range(4) for j in range(i + 1, 4) if gaps[:, :, i, j].min() <= radius}
     assert {violation.pair for violation in near.violations} >= inside
+
+
+@pytest.mark.parametrize("window", [1, 2, 7, 29])
+def test_a_trace_in_pieces_gives_the_same(window, monkeypatch):
+    generator = np.random.default_rng(3)
+    rest = np.repeat(generator.normal(scale=0.3, size=(1, 4, 2)), 4, axis=0)  # violations that last
+    places = np.concatenate([generator.normal(scale=0.6, size=(30, 4, 2)), rest, generator.normal(size=(30, 4, 2))])
+    places[50, 2] = np.nan
+    trace = at_places(places, [NO_CLAIMS])
+    near, blocks = distances(trace), block_series(trace)
+    monkeypatch.setattr("echelon.sim.results.trace.WINDOW", window)
+    in_pieces = distances(trace)
+    assert len(near.violations) > 10
+    assert any(each.last_ns - each.first_ns > 3 * MS for each in near.violations)
+    assert (in_pieces.closest, in_pieces.violations) == (near.closest, near.violations)
+    np.testing.assert_array_equal(in_pieces.smallest, near.smallest)
+    for one, other in zip(block_series(trace).series, blocks.series, strict=True):
+        for name in (*PARTS, "norm"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 @pytest.mark.parametrize("enabled", [True, False])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import random
 
 import numpy as np
@@ -70,6 +71,35 @@ def test_common_of_the_same_and_of_nothing() -> None:
     assert np.array_equal(states[:, 1], same.states[1])
     times, states = TraceBuilder(paper()).build().common()
     assert (times.shape, states.shape) == ((0,), (0, 9, FIELDS))
+
+
+@pytest.mark.parametrize("times", [([*range(20)],) * 3, ([*range(20)], [*range(0, 40, 2)], [*range(1, 50)])])
+@pytest.mark.parametrize("overlap", [0, 1])
+def test_windows_are_the_whole_in_pieces(
+    times: tuple[list[int], ...], overlap: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("echelon.sim.results.trace.WINDOW", 3)
+    trace = trace_of_times(*times)
+    whole_ns, states = trace.common((4, 0))
+    covered: list[int] = []
+    for part, window in trace.windows((4, 0), overlap=overlap):
+        assert np.array_equal(window, states[part])
+        assert part.start == (covered[-1] + 1 - overlap if covered else 0)
+        covered = list(range(part.stop))
+    assert covered == list(range(len(whole_ns)))
+    assert np.array_equal(trace.common_ns(), whole_ns)
+
+
+def test_a_trace_in_a_file_reaches_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("echelon.large_arrays.LARGE", 1)
+    builder = TraceBuilder(paper())
+    for message in invented(paper(), 20):
+        builder.add(message)
+    trace = builder.build()
+    assert trace.in_file is not None
+    pickled = pickle.dumps(trace)
+    assert len(pickled) < len(pickle.dumps(paper())) + 2000  # no states
+    assert pickle.loads(pickled).digest() == trace.digest()
 
 
 def test_last_is_known_when_all_have_spoken() -> None:

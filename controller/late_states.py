@@ -19,6 +19,7 @@ Positions of robots below a child move as the child's centroid does.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -95,7 +96,8 @@ class LateStates:
             if child.positions is not None:
                 values[child.positions] += np.tile(moved[:2], length(child.positions) // 2)
             said.append(values)
-        while len(self._commanded) > 1 and self._commanded[1][0] <= oldest_ns:
+        # By a clock that drifts a held message becomes older: one command more is kept.
+        while len(self._commanded) > 2 and self._commanded[2][0] <= oldest_ns:
             self._commanded.popleft()
         return said
 
@@ -121,7 +123,7 @@ class LateStates:
         """Returns the motion from an instant to the present under the accelerations commanded to a child, (4,)."""
         delay_ns = self._children[number].command_delay_ns
         p, v = np.zeros(2), velocity
-        instants = [at_ns + delay_ns for at_ns, _ in self._commanded]
+        instants = [since_ns, *(at_ns + delay_ns for at_ns, _ in islice(self._commanded, 1, None))]
         for (_, accelerations), begin_ns, end_ns in zip(
             self._commanded, instants, [*instants[1:], time_ns], strict=True
         ):
@@ -129,9 +131,6 @@ class LateStates:
             if h > 0:
                 a = accelerations[number]
                 p, v = p + h * v + h**2 / 2 * a, v + h * a
-        begin_ns = instants[0]
-        if since_ns < begin_ns:  # before anything was commanded
-            p = p + (min(begin_ns, time_ns) - since_ns) * 1e-9 * velocity
         return np.concatenate((p, v - velocity))
 
 

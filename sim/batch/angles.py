@@ -13,6 +13,20 @@ _REST: Final = 6.07710050650619224932e-11
 _LARGE: Final = 1e5
 
 
+_SMALL: Final = 0.0625
+
+
+@fused
+def turned(c: float, s: float, angle: float, by: float) -> tuple[float, float]:
+    """Returns cos and sin of `angle` + `by`, where c and s are those of `angle`; the Taylor polynomials of a small angle."""
+    if not abs(by) < _SMALL:
+        return cos_sin(angle + by)
+    z = by * by
+    sine = by - by * z * (1 / 6 - z * (1 / 120 - z * (1 / 5040)))
+    less = z * (0.5 - z * (1 / 24 - z * (1 / 720 - z * (1 / 40320))))  # 1 - cos
+    return c - (c * less + s * sine), s + (c * sine - s * less)
+
+
 @fused
 def cos_sin(angle: float) -> tuple[float, float]:
     """Returns cos and sin of an angle, each to 1e-16 or a little more.

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
@@ -19,6 +20,8 @@ from echelon.sim.batch.refusals import refusal
 _WORD: Final = 2**64 - 1
 MOST_AT_ONCE: Final = 16
 """Largest number of runs that a thread takes at once"""
+PARTS: Final = 16
+"""Parts into which runs are divided at least if something is summed over runs.  They do not depend on threads, nor do sums"""
 
 
 def run_many(
@@ -27,6 +30,7 @@ def run_many(
     *,
     threads: int | None = None,
     traces: bool = False,
+    mean_squares: bool = False,
     say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
     progress: Callable[[int], None] = lambda done: None,
 ) -> BatchRuns:
@@ -34,7 +38,8 @@ def run_many(
 
     Each run is the one that the in-process engine makes of the plan with that seed, to rounding.  It ends at the first instant
     at which a robot's state is not finite.  Runs do not depend on `threads` (by default one for each core).  `traces` asks for
-    the robots' states too.  `say` gets a line when code must be compiled first, `progress` the number of runs done so far.
+    the robots' states too, `mean_squares` for E|e|² of each block over time.  `say` gets a line when code must be compiled
+    first, `progress` the number of runs done so far.
 
     Raises UsageError if there are no seeds, or if this engine cannot run the plan."""
     if not seeds or (threads is not None and threads < 1):
@@ -53,26 +58,55 @@ def run_many(
     reals = np.empty((len(seeds), len(kept.reals)))
     wholes = np.empty((len(seeds), len(kept.wholes)), dtype=np.int64)
     lost_ns = np.empty(len(seeds), dtype=np.int64)
+    sums_of = instants if mean_squares else 0, len(plan.blocks), 2
+    sums = np.zeros(sums_of)
 
-    def work(part: range) -> int:
-        scratch = np.empty(pools.reals), np.empty(pools.wholes, dtype=np.int64)
+    own = threading.local()
+
+    def work(part: range) -> tuple[int, NDArray[np.float64]]:
+        added = np.zeros(sums_of)
+        if not hasattr(own, "scratch"):
+            own.scratch = np.empty(pools.reals), np.empty(pools.wholes, dtype=np.int64)
+        real, whole = own.scratch
         whole_run.many_runs(
-            model, keys, part.start, part.stop, *scratch, traced, lost_ns, kept.reals, kept.wholes, reals, wholes
+            model,
+            keys,
+            part.start,
+            part.stop,
+            real,
+            whole,
+            traced,
+            added,
+            lost_ns,
+            kept.reals,
+            kept.wholes,
+            reals,
+            wholes,
         )
-        return len(part)
+        return len(part), added
 
     work(range(0))
     count = threads or len(os.sched_getaffinity(0))
-    size = max(1, min(MOST_AT_ONCE, len(seeds) // (4 * count)))
+    size = max(1, min(MOST_AT_ONCE, len(seeds) // (PARTS if mean_squares else 4 * count)))
     parts = [range(first, min(first + size, len(seeds))) for first in range(0, len(seeds), size)]
     pool, done = ThreadPoolExecutor(count), 0
     try:
-        for finished in pool.map(work, parts):
+        for finished, added in pool.map(work, parts):
+            sums += added
             done += finished
             progress(done)
     finally:
         pool.shutdown(cancel_futures=True)
-    return outcomes(plan, model, seeds, lost_ns, reals, wholes, traced if traces else None)
+    return outcomes(
+        plan,
+        model,
+        seeds,
+        lost_ns,
+        reals,
+        wholes,
+        traced if traces else None,
+        sums if mean_squares else None,
+    )
 
 
 def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.int64]:

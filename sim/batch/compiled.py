@@ -20,7 +20,7 @@ import numba
 
 from echelon.controller.laws import terminal_sliding
 from echelon.plan import delay_tables
-from echelon.runtime import fates
+from echelon.runtime import ages, fates
 
 _compiler: Any = numba  # without types: what there is of them changes from version to version
 P = ParamSpec("P")
@@ -37,17 +37,22 @@ def fused(function: Callable[P, R]) -> Callable[P, R]:
     return _compiled(function, fused=True)
 
 
-def _compiled(function: Callable[P, R], fused: bool) -> Callable[P, R]:
+def apart(function: Callable[P, R]) -> Callable[P, R]:
+    """As `compiled`, for what is seldom called: it stays a function of its own, out of the way of what is called often."""
+    return _compiled(function, fused=False, inlined=False)
+
+
+def _compiled(function: Callable[P, R], fused: bool, inlined: bool = True) -> Callable[P, R]:
     _compiler.config.CACHE_DIR, before = str(cache_folder()), _compiler.config.CACHE_DIR
     try:
         # Nothing is allocated, so nothing needs counts of references (_nrt).  A call passes seven numbers for each array, often
-        # more than the function itself has to do: all become one function.
+        # more than the function itself has to do: what is called often becomes one function.
         marked: Callable[P, R] = _compiler.njit(
             cache=True,
             nogil=True,
             error_model="numpy",
             fastmath={"contract"} if fused else False,
-            forceinline=True,
+            forceinline=inlined,
             _nrt=False,
         )(function)
         return marked
@@ -62,7 +67,7 @@ def is_kept() -> bool:
 
 def sources() -> list[Path]:
     """Returns the sources of the compiled code: this room, and modules whose numbers are compiled into it."""
-    modules = terminal_sliding, delay_tables, fates
+    modules = terminal_sliding, delay_tables, ages, fates
     return [*sorted(Path(__file__).parent.glob("*.py")), *(Path(module.__file__ or "") for module in modules)]
 
 

@@ -1,19 +1,21 @@
 """From a plan to arrays (`records`): once for each plan, before its runs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from math import gcd, lcm
+from math import ceil, gcd, lcm
 from typing import Any
 
 import numpy as np
 
+from echelon.controller.late_states import EXTRAPOLATE, PREDICT
 from echelon.controller.laws import Integral, Linear, TerminalSliding
 from echelon.controller.laws.law import Block, law_block
 from echelon.controller.trajectory import Circle, Line, Sine
 from echelon.controller.transformation import desired_shape
 from echelon.messages import Channel
 from echelon.plan.layout import NodeLayout, acceleration_of, length
-from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan
+from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, RobotPlan
+from echelon.runtime.ages import EXACT
 from echelon.sim.batch import records as r
 from echelon.sim.batch.links import fates_of
 from echelon.sim.batch.outcomes import fractions, late_sixths_ns
@@ -69,13 +71,14 @@ class ModelMaker:
             if (link.source, link.channel) == (source, channel) and not link.prompt:
                 # A message may be sent a period late, and is asked for a period of the receiver later.
                 asked_ns = self.plan.formation[link.receiver].period_ns
-                most = max(most, (link.delay_max_ns + asked_ns) // link.period_ns + 4)
+                late_ns = min(link.delay_max_ns, self.plan.duration_ns) + asked_ns
+                most = max(most, late_ns // link.period_ns + 4)
         return 1 << (most - 1).bit_length()
 
     def _stream(self, source: int, channel: Channel) -> dict[str, Any]:
         depth = self._depth(source, channel)
         if channel is Channel.STATE:
-            length = 4
+            length = self._state_length(source)
         else:
             length = next(
                 link.size or 0 for link in self.plan.links if (link.source, link.channel) == (source, channel)
@@ -87,8 +90,14 @@ class ModelMaker:
             "marks_at": self.pools.whole(1 + 2 * depth),
         }
 
+    def _state_length(self, robot: int) -> int:
+        """Returns how many values of a robot's STATE are used: position and velocity, and its acceleration if a node moves late
+        states on with it."""
+        extrapolated = (link.policy == EXTRAPOLATE for link in self.plan.links if link.source == robot)
+        return 6 if any(extrapolated) else 4
+
     def _link(self, at: int, stream: Mapping[str, Any]) -> dict[str, Any]:
-        link, pools = self.plan.links[at], self.pools
+        plan, pools, link = self.plan, self.pools, self.plan.links[at]
         parts = self._parts(at)
         size = 0 if link.prompt else max(first + count for first, count in parts)
         shift = parts[0][0] if len(parts) == 1 and size else 0  # of one part only that part is kept
@@ -99,20 +108,47 @@ class ModelMaker:
             "stream_marks_at": stream["marks_at"],
             "prompt": link.prompt,
             "timeout_ns": link.timeout_ns,
+            "end_ns": plan.duration_ns,
             "at": pools.real(size - shift) - shift,
+            "brought": self._brought(link),
+            "odd_clocks": not link.clocks_are_true,
+            "of_robot": link.channel is Channel.STATE,
             "zeros_at": pools.real(stream["length"]) if link.policy == "zero" else -1,
             "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
         } | fates_of(link, pools)
+        record |= self._ages(link)
         for number, (first, count) in enumerate(parts, start=1):
             record |= {f"first_{number}": first, f"size_{number}": count}
         return record
+
+    def _brought(self, link: LinkPlan) -> int:
+        """Returns how late states of a link are brought to the present."""
+        if link.channel not in (Channel.STATE, Channel.GROUP_STATE):
+            return r.AS_THEY_ARE
+        otherwise = r.WITH_REFERENCE if self.plan.reference == "message" else r.AS_THEY_ARE
+        return {EXTRAPOLATE: r.EXTRAPOLATED, PREDICT: r.PREDICTED}.get(link.policy, otherwise)
+
+    def _ages(self, link: LinkPlan) -> dict[str, int]:
+        """Returns where the ages of a link's messages are counted."""
+        pools, duration_ns, receiver = self.pools, self.plan.duration_ns, self.plan.formation[link.receiver]
+        acts_late = receiver.event_driven and not all(each.prompt for each in self.plan.links_into(link.receiver))
+        # A message is used once in each period of the receiver, and when it arrives or becomes too old.
+        most = duration_ns // receiver.period_ns + 3 * (duration_ns // link.period_ns) + 4
+        if link.prompt and not acts_late and receiver.period_ns % link.period_ns == 0:
+            most = 0  # it is always new
+        many = most > EXACT
+        return {
+            "ages_at": pools.whole(min(most, r.LISTED)),
+            "uses_at": pools.whole(EXACT if many else 0),
+            "bins_at": pools.whole(duration_ns.bit_length() << 7 if many else 0),
+        }
 
     def _parts(self, at: int) -> list[tuple[int, int]]:
         """Returns what a receiver uses of the messages of a link: places and lengths."""
         link, plan = self.plan.links[at], self.plan
         receiver = plan.formation[link.receiver]
         if link.channel is Channel.STATE:
-            return [(0, 4)]
+            return [(0, self._state_length(link.source))]
         if link.channel is Channel.GROUP_STATE:
             return [(0, link.size or 0)]
         slices = [acceleration_of(receiver)]
@@ -178,6 +214,29 @@ class ModelMaker:
             "rates": state.rates.start,
             "rates_size": 2 * len(plan.robots) if plan.coupled else 0,
             "positions": state.positions.start,
+        } | self._commands(node, [plan.links[link] for link in links])
+
+    def _commands(self, node: NodePlan, links: Sequence[LinkPlan]) -> dict[str, int]:
+        """Returns where a node keeps its commands: those that may act later than a message was sent that comes into use."""
+        plan, pools, count = self.plan, self.pools, len(links)
+        policies = {link.policy for link in links}
+        of_nodes = any(link.policy == EXTRAPOLATE and link.channel is Channel.GROUP_STATE for link in links)
+        if not (of_nodes or PREDICT in policies):
+            return {"commands_at": -1, "commands_marks_at": -1, "command_delays_at": -1}
+        down = {link.receiver: link.delay_min_ns for link in plan.links if link.source == node.index}
+        delays_ns = [down[link.source] for link in links]
+        most = 1
+        for link, delay_ns in zip(links, delays_ns, strict=True):
+            if link.policy == PREDICT:
+                # A message is used at the latest two periods after its arrival.
+                late_ns = link.delay_max_ns + 2 * node.period_ns + delay_ns + _clocks_differ_ns(link, plan.duration_ns)
+                most = max(most, min(late_ns, plan.duration_ns) // node.period_ns + 5)
+        depth = 1 << (most - 1).bit_length()
+        return {
+            "commands_at": pools.real((depth + 2) * count * r.COMMAND_REALS),
+            "commands_marks_at": pools.whole(1 + depth + 3 * count),
+            "commands_mask": depth - 1,
+            "command_delays_at": pools.index(delays_ns),
         }
 
     def _carried(self, layout: NodeLayout, count: int) -> int:
@@ -253,6 +312,7 @@ class ModelMaker:
             "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),
             "closest_at": pools.whole(4),
+            "slots_at": pools.whole(r.SLOTS),
             "avoidance_radius": avoidance.avoidance_radius,
             "sensing_radius": avoidance.sensing_radius,
             "force_limit": avoidance.force_limit,
@@ -260,7 +320,6 @@ class ModelMaker:
             "gamma": law.gamma if sliding else 0.0,
             "beta": law.beta if sliding else 0.0,
             "kappa": law.kappa if sliding else 0.0,
-            "of_message": plan.reference == "message",
             "ahead": plan.lead * plan.root.period_ns * 1e-9,
         }
 
@@ -274,3 +333,9 @@ class ModelMaker:
         if isinstance(made, Sine):
             return r.SINE, [*made.start, made.speed, made.amplitude, made.rate]
         return r.WAYPOINTS, [(t, *point) for t, point in zip(made.times, made.points, strict=True)]
+
+
+def _clocks_differ_ns(link: LinkPlan, duration_ns: int) -> int:
+    """Returns by how much the age that a receiver reads may differ from the true one."""
+    clocks = link.source_clock, link.receiver_clock
+    return sum(abs(clock.offset_ns) + ceil(abs(clock.drift) * duration_ns) for clock in clocks)

@@ -3,7 +3,7 @@
 from math import ceil, isfinite, sqrt
 from typing import Any, Final
 
-from echelon.sim.batch.angles import cos_sin
+from echelon.sim.batch.angles import cos_sin, turned
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.records import (
     COS,
@@ -136,10 +136,9 @@ def inverse(robot: Any, real: Any, ax: float, ay: float, lead: float) -> tuple[f
     d = robot.offset
     v_dot = c * ax + s * ay + d * omega * omega
     omega_dot = (c * ay - s * ax - v * omega) * robot.per_offset
-    theta += lead * (omega + 0.5 * lead * omega_dot)
+    c, s = turned(c, s, theta, lead * (omega + 0.5 * lead * omega_dot))
     v += lead * v_dot
     omega += lead * omega_dot
-    c, s = cos_sin(theta)
     total = robot.half_sum * (c * ax + s * ay + d * omega * omega)
     difference = robot.half_difference * (c * ay - s * ax - v * omega)
     return total + difference, total - difference
@@ -172,8 +171,8 @@ def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: floa
     turn = h * (abs(omega) + abs(omega_dot) * h)
     if turn <= 0.5:
         t_1, t_2 = _INNER * h, (1 - _INNER) * h
-        c_i, s_i = cos_sin(theta + t_1 * (omega + half * t_1))
-        c_j, s_j = cos_sin(theta + t_2 * (omega + half * t_2))
+        c_i, s_i = turned(c_0, s_0, theta, t_1 * (omega + half * t_1))
+        c_j, s_j = turned(c_0, s_0, theta, t_2 * (omega + half * t_2))
         v_i, v_j = v + v_dot * t_1, v + v_dot * t_2
         ends, inner = h * _ENDS, h * _MIDDLE
         x += ends * (v * c_0 + v_1 * c_1) + inner * (v_i * c_i + v_j * c_j)
@@ -214,34 +213,38 @@ def body_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float
     if isfinite(pace):
         count = 500 if pace >= 10.0 else max(1, ceil(pace / 0.02))
     k = h / count
+    c, s = real[at + COS], real[at + SIN]
     for _ in range(count):
-        a_x, a_y, a_v, a_w = _rates(robot, theta, v, omega, push, turn)
+        a_x, a_y, a_v, a_w = _rates(robot, c, s, v, omega, push, turn)
         o_b = omega + 0.5 * k * a_w
-        b_x, b_y, b_v, b_w = _rates(robot, theta + 0.5 * k * omega, v + 0.5 * k * a_v, o_b, push, turn)
+        c_b, s_b = turned(c, s, theta, 0.5 * k * omega)
+        b_x, b_y, b_v, b_w = _rates(robot, c_b, s_b, v + 0.5 * k * a_v, o_b, push, turn)
         o_c = omega + 0.5 * k * b_w
-        c_x, c_y, c_v, c_w = _rates(robot, theta + 0.5 * k * o_b, v + 0.5 * k * b_v, o_c, push, turn)
+        c_c, s_c = turned(c, s, theta, 0.5 * k * o_b)
+        c_x, c_y, c_v, c_w = _rates(robot, c_c, s_c, v + 0.5 * k * b_v, o_c, push, turn)
         o_e = omega + k * c_w
-        e_x, e_y, e_v, e_w = _rates(robot, theta + k * o_c, v + k * c_v, o_e, push, turn)
+        c_e, s_e = turned(c, s, theta, k * o_c)
+        e_x, e_y, e_v, e_w = _rates(robot, c_e, s_e, v + k * c_v, o_e, push, turn)
         sixth = k / 6
         x += sixth * (a_x + 2 * (b_x + c_x) + e_x)
         y += sixth * (a_y + 2 * (b_y + c_y) + e_y)
         theta += sixth * (omega + 2 * (o_b + o_c) + o_e)
         v += sixth * (a_v + 2 * (b_v + c_v) + e_v)
         omega += sixth * (a_w + 2 * (b_w + c_w) + e_w)
+        c, s = cos_sin(theta)
     real[at + X] = x
     real[at + Y] = y
     real[at + THETA] = theta
     real[at + V] = v
     real[at + OMEGA] = omega
-    real[at + COS], real[at + SIN] = cos_sin(theta)
+    real[at + COS], real[at + SIN] = c, s
 
 
 @fused
 def _rates(
-    robot: Any, theta: float, v: float, omega: float, push: float, turn: float
+    robot: Any, c: float, s: float, v: float, omega: float, push: float, turn: float
 ) -> tuple[float, float, float, float]:
     """Returns the rates of x, y, v and ω; that of θ is ω."""
-    c, s = cos_sin(theta)
     d = robot.offset
     return (
         v * c - d * omega * s,

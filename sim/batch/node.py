@@ -3,9 +3,10 @@
 from typing import Any
 
 from echelon.sim.batch.compiled import fused
+from echelon.sim.batch.late_states import bring, note_commands
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.potential import add_pair_forces
-from echelon.sim.batch.records import STAMP
+from echelon.sim.batch.records import STAMP, WITH_REFERENCE
 from echelon.sim.batch.streams import hear, heard_ns, read_age_ns, room, say, take_up
 
 
@@ -30,7 +31,7 @@ def gather(
     is_known = False  # the reference at `time_ns`
     for child in range(count):
         link = links[index[node.links_at + child]]
-        said = hear(link, index, real, whole, time_ns)
+        said = hear(link, run, index, real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -40,15 +41,15 @@ def gather(
             there, here, size = index[3 * part], index[3 * part + 1], index[3 * part + 2]
             for value in range(size):
                 real[node.state_at + here + value] = real[said + there + value]
-        if run.of_message:
-            age_ns = read_age_ns(link, time_ns, whole[link.marks_at + STAMP])
-            if age_ns == 0:
-                continue
-            if not is_known:
-                x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
-                is_known = True
-            then_x, then_y, then_vx, then_vy, _, _ = desired(run, table, max(0, time_ns - age_ns) * 1e-9)
-            _bring(node, run, index, real, child, x - then_x, y - then_y, vx - then_vx, vy - then_vy)
+        if link.brought:
+            since_ns = whole[link.marks_at + STAMP]
+            if link.odd_clocks:
+                since_ns = time_ns - read_age_ns(link, time_ns, since_ns)
+            if since_ns != time_ns:
+                if link.brought == WITH_REFERENCE and not is_known:
+                    x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
+                    is_known = True
+                bring(node, run, link, table, index, real, whole, child, said, time_ns, since_ns, x, y, vx, vy)
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -59,25 +60,6 @@ def gather(
             for value in range(up.length):
                 real[place + value] = real[node.state_at + value]
         say(up, whole, time_ns, 1 - complete)
-
-
-@fused
-def _bring(node: Any, run: Any, index: Any, real: Any, child: int, x: float, y: float, vx: float, vy: float) -> None:
-    """Moves a child's state on as the reference has moved, by (x, y) and (vx, vy), since the time of its message
-    (controller.node)."""
-    at = node.s_at + 4 * child
-    real[at] += x
-    real[at + 1] += y
-    real[at + 2] += vx
-    real[at + 3] += vy
-    if not run.avoidance:
-        return
-    for part in range(index[node.carried_at + child], index[node.carried_at + child + 1]):
-        here, size = index[3 * part + 1], index[3 * part + 2]
-        if here >= node.positions:
-            for value in range(0, size, 2):
-                real[node.state_at + here + value] += x
-                real[node.state_at + here + value + 1] += y
 
 
 @fused
@@ -133,7 +115,7 @@ def steer(
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
-        said = hear(links[node.link], index, real, whole, time_ns)
+        said = hear(links[node.link], run, index, real, whole, time_ns)
         if said < 0:
             complete = 0
         else:
@@ -147,6 +129,8 @@ def steer(
             say(streams[node.reference], whole, time_ns, 1)
         if node.command >= 0:
             say(streams[node.command], whole, time_ns, 1)
+        if node.commands_at >= 0:
+            note_commands(node, real, whole, time_ns, False)
         return
     if node.rates_size == 0:
         rates = -1
@@ -155,6 +139,8 @@ def steer(
         _add_forces(node, run, table, index, real, whole, forces)
         f_pot = node.f_pot_at
     _accelerate(node, run, blocks, table, index, real, rates, f_pot)
+    if node.commands_at >= 0:
+        note_commands(node, real, whole, time_ns, True)
     if node.command >= 0:
         command = streams[node.command]
         place = room(command, whole)

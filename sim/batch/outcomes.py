@@ -33,7 +33,7 @@ ROBOT_FIELDS: Final = np.dtype(
 )
 LINK_FIELDS: Final = np.dtype(
     [(name, "i8") for name in ("sent", "delivered", "lost", "in_flight", "duplicates", "used", "held")]
-    + [(name, "f8") for name in ("age_mean", "age_max")]
+    + [(name, "f8") for name in ("age_mean", "age_p50", "age_p95", "age_p99", "age_max")]
 )
 
 
@@ -59,6 +59,12 @@ class BatchRuns:
     """(T,): instants of the traces [s]"""
     traces: NDArray[np.float64] | None
     """(R, T, robots, len(TRACED)): states at the instants that all robots share; None if they were not asked for"""
+    mean_squares: NDArray[np.float64] | None
+    """(T, blocks): E|e|², the mean over the runs of the squared error of each block [m²], infinite once a run has diverged;
+    None if it was not asked for.  Where E|e|² grows though most runs settle, a few runs make most of the mean; then it takes
+    many runs, and the standard error is too small with few"""
+    mean_squares_error: NDArray[np.float64] | None
+    """(T, blocks): standard error of this mean [m²]; NaN with one run, and where the mean is infinite"""
 
 
 def fractions(plan: Plan) -> tuple[float, ...]:
@@ -85,7 +91,7 @@ class Kept:
         """Returns the places for a model, in the order in which `Outcomes` takes them."""
         run, marks = model.run[0], r.BLOCK_WHOLES + int(model.run["fractions"][0])
         reals = [at + number for at in model.blocks["measures_at"].tolist() for number in range(r.BLOCK_REALS)]
-        reals += [at + number for at in model.robots["at"].tolist() for number in range(r.S_RIGHT, r.ROBOT_REALS)]
+        reals += [at + number for at in model.robots["at"].tolist() for number in range(r.S_RIGHT, r.A_X)]
         wholes = [at + number for at in model.blocks["marks_at"].tolist() for number in range(marks)]
         wholes += [at + number for at in model.links["marks_at"].tolist() for number in r.COUNTS]
         wholes += [int(run["closest_at"]) + number for number in range(4)]
@@ -100,10 +106,12 @@ def outcomes(
     reals: NDArray[np.float64],
     wholes: NDArray[np.int64],
     traces: NDArray[np.float64] | None,
+    sums: NDArray[np.float64] | None,
 ) -> BatchRuns:
-    """Returns what was measured, from the results `reals` and `wholes` of each run (`Kept`)."""
+    """Returns what was measured, from the results `reals` and `wholes` of each run (`Kept`), and from the sums of |e|² and of
+    |e|⁴ over the runs, (T, blocks, 2)."""
     count, common_ns = len(seeds), int(model.run["common_ns"][0])
-    shapes = [(len(plan.blocks), r.BLOCK_REALS), (len(plan.robots), r.ROBOT_REALS - r.S_RIGHT)]
+    shapes = [(len(plan.blocks), r.BLOCK_REALS), (len(plan.robots), r.A_X - r.S_RIGHT)]
     of_blocks, of_robots, distance = _split(reals, shapes)
     shapes = [(len(plan.blocks), r.BLOCK_WHOLES + len(fractions(plan))), (len(plan.links), len(r.COUNTS))]
     marks, of_links, closest = _split(wholes, shapes)
@@ -124,7 +132,15 @@ def outcomes(
         settling.claims(),
         np.arange(0, plan.duration_ns + 1, common_ns) / 1e9,
         traces,
+        *((None, None) if sums is None else _means(sums, count)),
     )
+
+
+def _means(sums: NDArray[np.float64], runs: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns mean and standard error, from the sums of a number of values and of their squares."""
+    mean, square = np.moveaxis(sums, -1, 0) / runs
+    with np.errstate(all="ignore"):
+        return mean, _finite(np.sqrt(np.maximum(square - np.square(mean), 0.0) / (runs - 1)))
 
 
 def _split(values: NDArray[Any], shapes: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:
@@ -223,7 +239,7 @@ def _robots(plan: Plan, of_robots: NDArray[np.float64]) -> Records:
 
 
 def _links(plan: Plan, of_links: NDArray[np.int64]) -> Records:
-    sent, delivered, lost, duplicates, used, held, age_sum, age_max = np.moveaxis(of_links, 2, 0)
+    sent, delivered, lost, duplicates, used, held, age_sum, age_max, *percentiles = np.moveaxis(of_links, 2, 0)
     prompt = np.array([link.prompt for link in plan.links], dtype=bool)
     links = np.zeros(sent.shape, dtype=LINK_FIELDS)
     links["sent"], links["lost"], links["used"], links["held"] = sent, lost, used, held
@@ -231,5 +247,6 @@ def _links(plan: Plan, of_links: NDArray[np.int64]) -> Records:
     links["delivered"] = np.where(prompt, sent, delivered)
     links["in_flight"] = sent - lost - links["delivered"]
     links["age_mean"] = np.where(used > 0, age_sum / np.maximum(used, 1) / 1e9, np.nan)
-    links["age_max"] = np.where(used > 0, age_max / 1e9, np.nan)
+    for name, age_ns in zip(("age_max", "age_p50", "age_p95", "age_p99"), (age_max, *percentiles), strict=True):
+        links[name] = np.where(used > 0, age_ns / 1e9, np.nan)
     return links

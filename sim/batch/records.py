@@ -25,12 +25,10 @@ RUN: Final = _record(
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
     # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and their velocities; places of robots
     # before, and their order (potential); square of the smallest distance; the pair and its instant, then the number of
-    # violations
-    "due_at places_at rates_at before_at order_at distance_at closest_at "
+    # violations; a hash table (ages)
+    "due_at places_at rates_at before_at order_at distance_at closest_at slots_at "
     # from when on amplitudes are summed up: the last three sixths of the run [ns]
-    "sooner_ns earlier_ns last_ns "
-    # whether late states are compared with the reference of their own time
-    "of_message",
+    "sooner_ns earlier_ns last_ns",
     # `ahead`: how far the feed-forward is led [s]
     "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead",
 )
@@ -53,7 +51,11 @@ NODE: Final = _record(
     # and its robots in order (potential)
     "block desired_at s_at e_at c_at eta_at a_at f_pot_at forces_at order_at "
     # its GROUP_STATE, whether it has one, when it acted last, and places in its GROUP_STATE
-    "state_at has_state_at acted_at own_rates centroid_rates rates rates_size positions",
+    "state_at has_state_at acted_at own_rates centroid_rates rates rates_size positions "
+    # its last mask + 1 commands, each `COMMAND_REALS` of each child, then for each child the command that acted when its
+    # message in use was sent and the one before; in `whole` the number of commands, their instants, then for each child the
+    # number of that command and the instants of both; in `indices` the smallest delays of commands
+    "commands_at commands_marks_at commands_mask command_delays_at",
     "",
 )
 BLOCK: Final = _record(
@@ -72,7 +74,11 @@ STREAM: Final = _record(
 LINK: Final = _record(
     # its stream, as above; `at`: the message in use in `real`, `zeros_at`: what is used where it is too old (policy `zero`);
     # places and sizes of the parts that the receiver uses of a message
-    "length mask stream_at stream_marks_at prompt timeout_ns at zeros_at marks_at "
+    "length mask stream_at stream_marks_at prompt timeout_ns end_ns at zeros_at marks_at "
+    # how a late state is brought to the present (below), whether it is a robot's, whether clocks are wrong
+    "brought of_robot odd_clocks "
+    # ages of what is used: list, numbers of uses and bins in `whole` (ages)
+    "ages_at uses_at bins_at "
     "first_1 size_1 first_2 size_2 first_3 size_3 "
     # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
     "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
@@ -87,6 +93,11 @@ LINEAR, INTEGRAL, SLIDING = 0, 1, 2
 LINE, CIRCLE, SINE, WAYPOINTS = 0, 1, 2, 3
 """`RUN.trajectory`"""
 
+AS_THEY_ARE, WITH_REFERENCE, EXTRAPOLATED, PREDICTED = 0, 1, 2, 3
+"""`LINK.brought`"""
+COMMAND_REALS: Final = 6
+"""Of one child: acceleration, and velocity and displacement since run time 0 due to earlier commands"""
+
 # Places in a robot's part of `real`.
 X, Y, THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT, HELD_S = range(10)
 """... torques last held, and how long they were held [s]"""
@@ -95,7 +106,9 @@ P_RIGHT, P_LEFT, P_PEAK, P_SATURATED, P_PART = range(10, 15)
 whether one acted in an earlier part of the present torque period"""
 S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(15, 21)
 """The same of all periods so far, squares as means; those after the first second; number of periods"""
-ROBOT_REALS: Final = 21
+A_X, A_Y = 21, 22
+"""The acceleration that it follows [m/s²]"""
+ROBOT_REALS: Final = 23
 
 DRAWN, TABLE, TABLE_Z, BY_NUMBER, BY_TIME = range(5)
 """`LINK.kind`: uniform, a table of independent or of correlated delays, a trace"""
@@ -105,9 +118,16 @@ TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, DUPLICATES, USED, HELD, AG
 NEXT, NEWEST, OLDEST, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 22)
 F_OWN, F_LOSS, F_COPY, F_BURST = 22, 26, 30, 34
 """Draws of two messages"""
-LINK_WHOLES: Final = 38
+AGED, AGES, AGE_P50, AGE_P95, AGE_P99 = range(38, 43)
+"""Uses of messages older than the instant; number of their different ages once they are counted one by one, -1 if there are too
+many; percentiles (ages)"""
+LISTED: Final = 2048
+"""Length of a list of ages"""
+SLOTS: Final = 2048
+"""Size of the hash table of ages"""
+LINK_WHOLES: Final = 43
 """After these come the arrivals of the messages in flight [ns], then those of their second copies"""
-COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX)
+COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX, AGE_P50, AGE_P95, AGE_P99)
 """What of these is a result"""
 GONE: Final = -1
 """Arrival of a message that was delivered or lost"""

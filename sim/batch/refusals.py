@@ -22,7 +22,6 @@ _LINK: Final = frozenset({
     "receiver_clock",
 })  # fmt: skip
 """What this engine knows of a link"""
-_POLICIES: Final = ("hold", "hold_then_stop", "zero")
 
 
 def refusal(plan: Plan) -> str | None:
@@ -41,5 +40,3 @@ def _reasons(plan: Plan) -> Iterator[str]:
         for field in fields(link):
             if field.name not in _LINK and getattr(link, field.name) != field.default:
                 yield f"links: the batch engine does not know {field.name}"
-        if link.policy not in _POLICIES:
-            yield f"links: the batch engine knows the policies {', '.join(_POLICIES)} only"

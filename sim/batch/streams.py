@@ -3,6 +3,7 @@
 
 from typing import Any
 
+from echelon.sim.batch.ages import note_age
 from echelon.sim.batch.compiled import compiled
 from echelon.sim.batch.fates import fates, rounded
 from echelon.sim.batch.records import (
@@ -45,7 +46,7 @@ def say(stream: Any, whole: Any, time_ns: int, is_null: int) -> None:
 
 
 @compiled
-def hear(link: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
+def hear(link: Any, run: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
     """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
     use.  Must be called with ascending instants."""
     marks = link.marks_at
@@ -53,17 +54,19 @@ def hear(link: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
         number = whole[link.stream_marks_at] - 1
         whole[marks + TAKEN] = number + 1
         mark = link.stream_marks_at + 1 + 2 * (number & link.mask)
-        whole[marks + STAMP], whole[marks + IS_NULL] = whole[mark], whole[mark + 1]
+        sent_ns, is_null = whole[mark], whole[mark + 1]
+        whole[marks + STAMP] = sent_ns
         place = link.stream_at + (number & link.mask) * link.length
     else:
         take_up(link, index, whole)
         receive(link, whole, time_ns)
         _use(link, real, whole)
         number, place = whole[marks + IN_USE], link.at
-    if number < 0 or whole[marks + IS_NULL]:
+        sent_ns, is_null = whole[marks + STAMP], whole[marks + IS_NULL]
+    if number < 0 or is_null:
         return -1
-    age = time_ns - whole[marks + STAMP]
-    if link.timeout_ns < FAR and read_age_ns(link, time_ns, whole[marks + STAMP]) > link.timeout_ns:
+    age = time_ns - sent_ns
+    if link.timeout_ns < FAR and read_age_ns(link, time_ns, sent_ns) > link.timeout_ns:
         return int(link.zeros_at)
     whole[marks + USED] += 1
     if age != 0:
@@ -72,6 +75,7 @@ def hear(link: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
         whole[marks + AGE_SUM] += age
         if age > whole[marks + AGE_MAX]:
             whole[marks + AGE_MAX] = age
+        note_age(link, run, whole, age)
     whole[marks + LAST] = number
     return int(place)
 
@@ -85,7 +89,8 @@ def read_age_ns(link: Any, time_ns: int, sent_ns: int) -> int:
 
 @compiled
 def take_up(link: Any, index: Any, whole: Any) -> None:
-    """Draws what becomes of the messages that were sent since the last call."""
+    """Draws what becomes of the messages that were sent since the last call.  Those that arrive after the run are not kept, so
+    that a heavy tail costs nothing."""
     if link.prompt:
         return
     marks = link.marks_at
@@ -103,6 +108,10 @@ def take_up(link: Any, index: Any, whole: Any) -> None:
             whole[copies + slot] = max(sent_ns + second, whole[marks + LATEST]) if link.fifo else sent_ns + second
         if first != GONE:
             whole[marks + LATEST] = whole[arrivals + slot]
+        if whole[arrivals + slot] > link.end_ns:
+            whole[arrivals + slot] = GONE
+        if whole[copies + slot] > link.end_ns:
+            whole[copies + slot] = GONE
         number += 1
     whole[marks + TAKEN] = number
 

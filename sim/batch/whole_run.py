@@ -1,13 +1,17 @@
 """One whole run, and many of them: what a thread of the batch engine does."""
 
-from math import cos, isfinite, sin
+from math import cos, inf, isfinite, sin
 from typing import Any, Final
 
+from echelon.sim.batch.ages import find_percentiles
 from echelon.sim.batch.compiled import compiled, is_kept
+from echelon.sim.batch.late_states import begin_commands
 from echelon.sim.batch.measures import measure
 from echelon.sim.batch.motion import move
 from echelon.sim.batch.node import gather, steer
 from echelon.sim.batch.records import (
+    A_X,
+    A_Y,
     COS,
     FAR,
     HELD_S,
@@ -15,6 +19,7 @@ from echelon.sim.batch.records import (
     KEY_0,
     LAST,
     M_FINITE,
+    M_LAST,
     NEWEST,
     NEXT,
     OMEGA,
@@ -44,12 +49,13 @@ __all__ = ["is_kept", "many_runs", "whole_run"]
 
 
 @compiled
-def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
+def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any, sums: Any) -> int:
     """Runs a plan; returns the instant at which a robot's state is not finite [ns], or -1.  What is measured is in `real` and
     `whole` then.
 
     `keys`: two Philox keys of each link, (links, 4), the bits of its words as integers.  `trace`: states of the robots at the
-    instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted."""
+    instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted.  `sums`: |e|² and |e|⁴ of each block are
+    added to it, (T, blocks, 2), or (0, blocks, 2)."""
     run = model.run[0]
     robots, nodes, blocks, streams, links = model.robots, model.nodes, model.blocks, model.streams, model.links
     table, index = model.table, model.indices
@@ -70,8 +76,13 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
                 for number in range(len(robots)):
                     for value in range(7):
                         trace[instant, number, value] = real[robots[number].at + value]
+            if len(sums) > instant:
+                _add_squares(blocks, real, sums, instant)
             instant += 1
         if lost_ns >= 0:
+            for later in range(instant, len(sums)):
+                for number in range(len(blocks)):
+                    sums[later, number, 0] = sums[later, number, 1] = inf
             return lost_ns
         for number in range(len(nodes)):
             node = nodes[number]
@@ -92,19 +103,30 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any) -> int:
 
 
 @compiled
+def _add_squares(blocks: Any, real: Any, sums: Any, instant: int) -> None:
+    """Adds |e|² and |e|⁴ of each block; infinity for what is not finite."""
+    for number in range(len(blocks)):
+        square = real[blocks[number].measures_at + M_LAST] ** 2
+        if not isfinite(square):
+            square = inf
+        sums[instant, number, 0] += square
+        sums[instant, number, 1] += square * square
+
+
+@compiled
 def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, due_ns: int) -> None:
     """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
     now_ns, end_ns = due_ns, due_ns + robot.period_ns
     while now_ns < end_ns:
-        said, until_ns = hear(link, index, real, whole, now_ns), end_ns
+        said, until_ns = hear(link, run, index, real, whole, now_ns), end_ns
         if robot.on_arrival:
             change = change_ns(link, whole, now_ns)
             until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
-        if said < 0:
-            move(robot, real, now_ns, until_ns, 0.0, 0.0, False)
-        else:
-            at = said + robot.command
-            move(robot, real, now_ns, until_ns, real[at], real[at + 1], True)
+        ax = ay = 0.0
+        if said >= 0:
+            ax, ay = real[said + robot.command], real[said + robot.command + 1]
+        move(robot, real, now_ns, until_ns, ax, ay, said >= 0)
+        real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
         now_ns = until_ns
 
 
@@ -136,8 +158,9 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
     real[run.distance_at] = 1e300
     for place in range(len(robots)):
         whole[run.order_at + place] = place
-    if run.avoidance:
-        for number in range(len(nodes)):
+    for number in range(len(nodes)):
+        begin_commands(nodes[number], whole)
+        if run.avoidance:
             for place in range(nodes[number].robots):
                 whole[nodes[number].order_at + place] = place
 
@@ -152,6 +175,9 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
     real[place + 1] = real[at + Y]
     real[place + 2] = v * c - across * s
     real[place + 3] = v * s + across * c
+    if stream.length > 4:
+        real[place + 4] = real[at + A_X]
+        real[place + 5] = real[at + A_Y]
     say(stream, whole, time_ns, 0)
     total = real[place] + real[place + 1] + real[place + 2] + real[place + 3] + real[at + THETA]
     total += real[at + OMEGA] + real[at + P_RIGHT] + real[at + P_LEFT] + real[at + P_PEAK]
@@ -170,13 +196,15 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
 
 @compiled
 def many_runs(
-    model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, traces: Any, lost_ns: Any,
+    model: Any, keys: Any, first: int, last: int, real: Any, whole: Any, traces: Any, sums: Any, lost_ns: Any,
     kept_reals: Any, kept_wholes: Any, reals: Any, wholes: Any,
 ) -> None:  # fmt: skip
     """Runs number `first` to `last` - 1; copies the results of each from the scratch (`real`, `whole`) to `reals[number]` and
     `wholes[number]`."""
     for number in range(first, last):
-        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)])
+        lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)], sums)
+        for at in range(len(model.links)):
+            find_percentiles(model.links[at], model.run[0], whole)
         for place in range(len(kept_reals)):
             reals[number, place] = real[kept_reals[place]]
         for place in range(len(kept_wholes)):

@@ -41,10 +41,11 @@ demo: $(VENV)/.run ## the paper's nine robots as processes over Zenoh, without a
 	$(BIN)/echelon report runs/demo runs/demo-avoidance --out runs/demo.html
 	@echo "Look at runs/demo.html in a browser; runs/demo/ holds the recording, the CAN log and the summary."
 
-docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, and public-names.md, from their source
+docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, public-names.md and the columns in sweep.md, from their source
 	$(BIN)/echelon schema scenario --markdown > docs/.new && mv docs/.new docs/scenario.md
 	$(BIN)/echelon schema summary > docs/.new && mv docs/.new docs/summary.schema.json
 	$(BIN)/echelon schema analysis > docs/.new && mv docs/.new docs/analysis.schema.json
+	PYTHONPATH=tests $(BIN)/python -m support.sweep_page > docs/.new && mv docs/.new docs/sweep.md
 	PYTHONPATH=tests $(BIN)/python -m support.public_names > docs/.new && mv docs/.new docs/public-names.md
 
 test: $(VENV)/.dev ## all tests

@@ -14,6 +14,8 @@ For notebooks and scripts:
     echelon.Simulation("lab")               a run step by step
     echelon.replay("runs/demo", {…})        its messages fed to roles with other values: where their outputs differ
     echelon.diff("runs/a", "runs/b")        where two runs part
+    echelon.sweep("lab", vary={"law.lead": "0:1:0.1"}, seeds=20)    many runs, with values that vary
+    echelon.open_sweep("runs/many")         a sweep from its folder
 
 To write parts of your own, derive from `Law`, `Plant`, `Trajectory` or `DriveProtocol` (docs/add-a-law.md,
 docs/add-a-protocol.md).
@@ -29,11 +31,12 @@ if TYPE_CHECKING:
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
-    from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
+    from echelon.sim.notebook import Loaded, diff, load, open_run, open_sweep, replay, run, sweep
     from echelon.sim.replay.comparison import ChannelComparison, Difference
     from echelon.sim.replay.difference import RunDifference
     from echelon.sim.replay.replay import Replay
     from echelon.sim.simulation import Simulation
+    from echelon.sim.sweep.study import Sweep
 
 __version__ = "0.1.0"
 __all__ = [
@@ -47,14 +50,17 @@ __all__ = [
     "Run",
     "RunDifference",
     "Simulation",
+    "Sweep",
     "Trajectory",
     "UserError",
     "__version__",
     "diff",
     "load",
     "open_run",
+    "open_sweep",
     "replay",
     "run",
+    "sweep",
 ]
 
 
@@ -62,10 +68,11 @@ def __getattr__(name: str) -> Any:
     """Imports a public name when it is first used: most processes and commands need only a few of them."""
     found: dict[str, Any] = {}
     match name:
-        case "Loaded" | "diff" | "load" | "open_run" | "replay" | "run":
-            from echelon.sim.notebook import Loaded, diff, load, open_run, replay, run
+        case "Loaded" | "diff" | "load" | "open_run" | "open_sweep" | "replay" | "run" | "sweep":
+            from echelon.sim.notebook import Loaded, diff, load, open_run, open_sweep, replay, run, sweep
 
-            found = {"Loaded": Loaded, "diff": diff, "load": load, "open_run": open_run, "replay": replay, "run": run}
+            found = {"Loaded": Loaded, "diff": diff, "load": load, "open_run": open_run, "open_sweep": open_sweep}
+            found |= {"replay": replay, "run": run, "sweep": sweep}
         case "Run":
             from echelon.sim.finished_run import Run
 
@@ -86,6 +93,10 @@ def __getattr__(name: str) -> Any:
             from echelon.sim.simulation import Simulation
 
             found = {"Simulation": Simulation}
+        case "Sweep":
+            from echelon.sim.sweep.study import Sweep
+
+            found = {"Sweep": Sweep}
         case "Plant":
             from echelon.agents.plant import Plant
 

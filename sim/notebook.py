@@ -11,8 +11,8 @@ import tomlkit
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.planning.loading import effective_toml
-from echelon.plugins import Plugin
 from echelon.scenario.tables import Scenario
+from echelon.scenario.toml_text import toml_value
 from echelon.shipped import EFFECTIVE, scenario_path
 from echelon.sim import run_folder
 from echelon.sim.finished_run import Run
@@ -22,6 +22,8 @@ from echelon.sim.parts import loading as parts
 if TYPE_CHECKING:
     from echelon.sim.replay.difference import RunDifference
     from echelon.sim.replay.replay import Replay
+    from echelon.sim.sweep.origin import Origin
+    from echelon.sim.sweep.study import Sweep
 
 
 _CHOICE: Final = re.compile(r"(?<![\w-])--(clock|engine) (virtual|wall|inprocess|processes)\b")
@@ -66,9 +68,12 @@ def load(scenario: AnyScenario, changes: Mapping[str, Any] | None = None) -> Loa
             return scenario
         return Loaded(*parts.parse(effective_toml(scenario.scenario), scenario.scenario.name, overrides))
     if isinstance(scenario, Mapping):
-        text = "".join(f"{tomlkit.key(str(key)).as_string()} = {toml_value(item)}\n" for key, item in scenario.items())
-        return Loaded(*parts.parse(text, "scenario", overrides))
+        return Loaded(*parts.parse(_toml(scenario), "scenario", overrides))
     return Loaded(*parts.load(scenario_path(str(scenario)), overrides))
+
+
+def _toml(tables: Mapping[str, Any]) -> str:
+    return "".join(f"{tomlkit.key(str(key)).as_string()} = {toml_value(item)}\n" for key, item in tables.items())
 
 
 @_arguments_for_options()
@@ -112,6 +117,80 @@ def run(
         replace=replace,
     )
     return launch(loaded.scenario, loaded.plan, options)
+
+
+@_arguments_for_options()
+def sweep(
+    scenario: AnyScenario,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    vary: Mapping[str, Any] | None = None,
+    design: Literal["grid", "zip", "random", "sobol"] = "grid",
+    samples: int = 0,
+    find: Mapping[str, str] | None = None,
+    share: float = 0.9,
+    seeds: int | None = None,
+    engine: Literal["batch", "inprocess", "processes"] | None = None,
+    workers: int | str | None = None,
+    out: str | Path | None = None,
+    allow_unstable: bool = False,
+    quiet: bool = False,
+) -> "Sweep":
+    """Runs a scenario many times with values that vary: `sweep("lab", vary={"law.lead": "0:1:0.1"}, seeds=20).to_pandas()`.
+
+    `scenario` and `changes` are those of `load`; the other options are those of `echelon sweep` (docs/sweep.md):
+
+    vary            by key a list of values, or a range `"0:0.4:0.02"`
+    design          `grid`, `zip`, or `random` and `sobol` with this number of `samples`
+    find            the key and range of a search for the largest value that holds: `{"links.uplink.delay": "0:0.5:0.01"}`
+    share           a point of the search holds if at least this share of its runs does
+    seeds           number of runs at each point, with the same seeds at each
+    engine          None: `batch` where it can, otherwise `inprocess`
+    workers         their number, or the address of a dask scheduler; None: one for each processor
+    out             folder for the tables, in which a sweep that broke off goes on; None: nothing is written
+    allow_unstable  sweep though the scenario is unstable before a value is varied
+    quiet           show no progress on standard error
+
+    Raises UserError for a wrong scenario, value or option before any run begins, and OSError if a file cannot be written."""
+    from echelon.sim.sweep.preparing import Request, prepare
+    from echelon.sim.sweep.search import Search
+    from echelon.sim.sweep.sweep import run as run_sweep
+    from echelon.sim.sweep.values import vary_of
+    from echelon.sim.view.sweep_progress import SweepDisplay
+
+    request = Request(
+        origin=_origin(scenario, changes),
+        varied=tuple(vary_of(key, values) for key, values in (vary or {}).items()),
+        kind=design,
+        samples=samples,
+        search=Search.of_mapping(find or {}),
+        share=share,
+        seeds=seeds,
+        engine=engine,
+        allow_unstable=allow_unstable,
+    )
+    prepared = prepare(request)
+    with SweepDisplay(prepared.notes, quiet=quiet) as display:
+        return run_sweep(prepared, None if out is None else Path(out), workers, display.show)
+
+
+def open_sweep(folder: str | Path) -> "Sweep":
+    """Returns the sweep in a folder.  Raises UserError if it is not the folder of a sweep, or a file of it cannot be read."""
+    from echelon.sim.sweep import study
+
+    return study.open_sweep(folder)
+
+
+def _origin(scenario: AnyScenario, changes: Mapping[str, Any] | None) -> "Origin":
+    """Returns the text of a scenario with its changes."""
+    from echelon.sim.sweep.origin import Origin
+
+    overrides = tuple(f"{key}={toml_value(value)}" for key, value in (changes or {}).items())
+    if isinstance(scenario, Loaded):
+        return Origin(effective_toml(scenario.scenario), scenario.scenario.name, Path(), overrides)
+    if isinstance(scenario, Mapping):
+        return Origin(_toml(scenario), "scenario", Path(), overrides)
+    return Origin.of_file(scenario_path(str(scenario)), overrides)
 
 
 def open_run(folder: str | Path) -> Run:
@@ -160,30 +239,3 @@ def _folder(run: str | Path | Run) -> Path:
     if run.folder is None:
         raise UserError("this run has no folder, so its messages were not recorded")
     return run.folder
-
-
-def toml_value(value: Any) -> str:
-    """Returns a Python or numpy value as TOML text.  Raises UserError for a value that has no TOML type."""
-    if hasattr(value, "tolist"):  # numpy
-        value = value.tolist()
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, (int, float)):
-        return repr(value)
-    if isinstance(value, (str, Path)):
-        return tomlkit.item(str(value)).as_string()
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(toml_value, value))}]"
-    if isinstance(value, Mapping):
-        return (
-            "{"
-            + ", ".join(f"{tomlkit.key(str(key)).as_string()} = {toml_value(item)}" for key, item in value.items())
-            + "}"
-        )
-    if isinstance(value, (type, Plugin)):
-        name = value.__name__ if isinstance(value, type) else type(value).__name__
-        raise UserError(
-            f"{name}: a scenario names a class by its file, which every process of a run reads: write it into a file beside "
-            f"the scenario, my_laws.py for example, and give 'my_laws.py:{name}'"
-        )
-    raise UserError(f"{value!r}: must be a number, a string, a boolean, a list or a dictionary to be set in a scenario")

@@ -79,7 +79,7 @@ def out_folder(scenario: str, out: Path | None, files: Iterable[str], replace: b
     `scenario` is the name of the scenario, `files` are the names of the files that the run may write.  Files of an earlier run
     are deleted: those of the same scenario, with `replace` those of any scenario.  Raises UsageError if a file is in the way or
     a run goes on in the folder, and OSError."""
-    path = _new(scenario) if out is None else out
+    path = new_folder(scenario) if out is None else out
     path.mkdir(parents=True, exist_ok=True)
     try:
         held = lock(path)
@@ -116,11 +116,12 @@ def _hash(file: Path) -> str:
         return file_digest(opened, "sha256").hexdigest()
 
 
-def _new(scenario: str) -> Path:
-    """Makes and returns `runs/<scenario>-<utc time>`, with a number at the end if another run began in the same second."""
+def new_folder(name: str) -> Path:
+    """Makes and returns `runs/<name>-<utc time>`, with a number at the end if another run began in the same second.  Raises
+    OSError."""
     stamp, count = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ"), 1
     while True:
-        path = Path("runs") / f"{scenario}-{stamp}{f'-{count}' if count > 1 else ''}"
+        path = Path("runs") / f"{name}-{stamp}{f'-{count}' if count > 1 else ''}"
         path.parent.mkdir(exist_ok=True)
         try:
             path.mkdir()

@@ -43,6 +43,12 @@ def _scenario() -> Commands:
     return COMMANDS
 
 
+def _sweep() -> Commands:
+    from echelon.cli.sweep import COMMANDS
+
+    return COMMANDS
+
+
 def _results() -> Commands:
     from echelon.cli.results import COMMANDS
 
@@ -84,6 +90,7 @@ ENTRIES: Final = {
     "new": Entry("write a scenario of your own to begin with", _scenario),
     "validate": Entry("check a scenario and say what it means", _scenario),
     "analyse": Entry("compute how much delay a scenario's control law bears", _scenario),
+    "sweep": Entry("run a scenario many times, with values that vary, and search for what it bears", _sweep),
     "dbc": Entry("print the DBC of a scenario's drives, for cantools, SavvyCAN and the like", _scenario),
     "schema": Entry("print the schema of scenario files, for editors, or of summaries", _scenario),
     "report": Entry("write the report of a run, or a comparison of several", _results),

@@ -17,8 +17,12 @@ def read_scenario(name: str, overrides: Sequence[str] = ()) -> tuple[Scenario, P
     """Returns the scenario with this name, and its plan; `overrides` are those of `--set`.  Raises UserError."""
     if name != STANDARD_INPUT:
         return load(scenario_path(name), overrides)
+    return parse(read_text(), "standard input", overrides)
+
+
+def read_text() -> str:
+    """Returns the text of a scenario on standard input.  Raises UserError if it is not UTF-8."""
     try:
-        text = sys.stdin.buffer.read().decode("utf-8-sig")
+        return sys.stdin.buffer.read().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ScenarioError(f"standard input: is not UTF-8 text (byte {error.start})") from None
-    return parse(text, "standard input", overrides)

@@ -14,6 +14,7 @@ from echelon.sim.batch.law import desired, to_shape
 from echelon.sim.batch.potential import sort_along
 from echelon.sim.batch.records import (
     BLOCK_WHOLES,
+    COS,
     M_FINITE,
     M_IAE,
     M_ISE,
@@ -22,7 +23,11 @@ from echelon.sim.batch.records import (
     M_OUT_FLOOR,
     M_PEAK,
     M_PEAK_NS,
+    M_SOONER,
     M_START,
+    OMEGA,
+    SIN,
+    V,
     X,
     Y,
 )
@@ -46,6 +51,9 @@ def measure(
     for robot in range(len(robots)):
         real[places + 2 * robot] = real[robots[robot].at + X]
         real[places + 2 * robot + 1] = real[robots[robot].at + Y]
+    is_late = time_ns >= run.sooner_ns
+    if is_late:
+        _note_rates(run, robots, real)
     for number in range(len(nodes)):
         node = nodes[number]
         count, z = node.count, node.f_pot_at
@@ -61,6 +69,9 @@ def measure(
         for row in range(2 * (count - 1)):
             square += (real[z + row] - table[node.desired_at + row]) ** 2
         _note_error(run, blocks[node.block], table, real, whole, sqrt(square), time_ns, step_ns)
+        if is_late:
+            own = run.rates_at + 2 * (len(robots) + number)
+            _note_amplitudes(run, node, own, blocks, table, index, real, square, time_ns)
         if node.link < 0:
             x, y, _, _, _, _ = desired(run, table, time_ns / 1e9)
             norm = sqrt((real[centroid] - x) ** 2 + (real[centroid + 1] - y) ** 2)
@@ -71,6 +82,45 @@ def measure(
         real[run.before_at + value] = real[places + value]
     if step_ns == 0:
         _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+
+
+@fused
+def _note_rates(run: Any, robots: Any, real: Any) -> None:
+    """Notes the robots' velocities."""
+    for robot in range(len(robots)):
+        at, place = robots[robot].at, run.rates_at + 2 * robot
+        c, s, v, across = real[at + COS], real[at + SIN], real[at + V], robots[robot].offset * real[at + OMEGA]
+        real[place] = v * c - across * s
+        real[place + 1] = v * s + across * c
+
+
+@fused
+def _note_amplitudes(
+    run: Any, node: Any, own: int, blocks: Any, table: Any, index: Any, real: Any, square: float, time_ns: int
+) -> None:
+    """Adds the squared amplitude of a node's blocks to the sum of its sixth (sim.results.ending).  z of the node is known,
+    and so is |e|² of its shape, `square`.  The velocity of its centroid goes to `own`."""
+    count, z, rates = node.count, node.f_pot_at, node.eta_at
+    for child in range(count):
+        place = run.rates_at + 2 * index[node.children_at + child]
+        real[node.a_at + 2 * child] = real[place]
+        real[node.a_at + 2 * child + 1] = real[place + 1]
+    to_shape(node, 2, table, real, node.a_at, rates)
+    centroid = 2 * (count - 1)
+    real[own] = real[rates + centroid]
+    real[own + 1] = real[rates + centroid + 1]
+    sixth = M_SOONER + (time_ns >= run.earlier_ns) + (time_ns >= run.last_ns)
+    block = blocks[node.block]
+    rest = 0.0
+    for row in range(centroid):
+        rest += (real[rates + row] + block.alpha * (real[z + row] - table[node.desired_at + row])) ** 2
+    real[block.measures_at + sixth] += square + rest * block.per_omega_squared
+    if node.link < 0:
+        block = blocks[-1]
+        x, y, vx, vy, _, _ = desired(run, table, time_ns / 1e9)
+        e_x, e_y = real[z + centroid] - x, real[z + centroid + 1] - y
+        rest = (real[own] - vx + block.alpha * e_x) ** 2 + (real[own + 1] - vy + block.alpha * e_y) ** 2
+        real[block.measures_at + sixth] += e_x * e_x + e_y * e_y + rest * block.per_omega_squared
 
 
 @fused

@@ -16,9 +16,10 @@ from echelon.plan.layout import NodeLayout, acceleration_of, length
 from echelon.plan.plan import Array, BlockPlan, NodePlan, Plan, RobotPlan
 from echelon.sim.batch import records as r
 from echelon.sim.batch.links import fates_of
-from echelon.sim.batch.outcomes import fractions
+from echelon.sim.batch.outcomes import fractions, late_sixths_ns
 from echelon.sim.batch.pools import Pools, records_of
 from echelon.sim.batch.robots import motion_of
+from echelon.sim.results.rates import oscillation
 from echelon.sim.results.settling import response_ns
 
 
@@ -194,6 +195,7 @@ class ModelMaker:
         diagonal = all(np.array_equal(matrix, np.diag(np.diag(matrix))) for matrix in matrices)
         places = [pools.table(np.diag(matrix) if diagonal else matrix) for matrix in matrices]
         coupling = weight @ self.plan.coupling[block.offset : block.offset + block.size]
+        alpha, omega_squared = oscillation(block)
         rows = [np.flatnonzero(row).tolist() for row in coupling]
         bounds = list(accumulate(map(len, rows), initial=0))
         return {
@@ -213,6 +215,8 @@ class ModelMaker:
             "period": seen.period_s,
             "bound": bound,
             "response_ns": response_ns(block),
+            "alpha": alpha,
+            "per_omega_squared": 1 / omega_squared if omega_squared > 0 else 0.0,
         }
 
     def _gains(self, block: Block) -> tuple[Array, Array, Array, Array, float]:
@@ -232,6 +236,7 @@ class ModelMaker:
         sliding = isinstance(law, TerminalSliding)
         return {
             "duration_ns": plan.duration_ns,
+            **dict(zip(("sooner_ns", "earlier_ns", "last_ns"), late_sixths_ns(plan), strict=True)),
             "tick_ns": gcd(*[one.period_ns for one in plan.formation]),
             "common_ns": lcm(*[robot.period_ns for robot in plan.robots]),
             "avoidance": avoidance.enabled,
@@ -243,6 +248,7 @@ class ModelMaker:
             "fractions": len(self.fractions),
             "due_at": pools.whole(len(plan.formation)),
             "places_at": pools.real(2 * len(plan.formation)),
+            "rates_at": pools.real(2 * len(plan.formation)),
             "before_at": pools.real(2 * len(plan.robots)),
             "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),

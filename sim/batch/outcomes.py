@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import lcm
 from typing import Any, Final
 
 import numpy as np
@@ -24,6 +25,7 @@ BLOCK_FIELDS: Final = np.dtype([
     (name, "f8")
     for name in (
         "start_error", "settling_2", "settling_5", "residual", "peak_error", "peak_time", "ise", "iae", "itae",
+        "sooner", "earlier", "level",
     )
 ])  # fmt: skip
 ROBOT_FIELDS: Final = np.dtype(
@@ -45,7 +47,8 @@ class BatchRuns:
     """(R,): `seed`; `diverged`, when a robot's state was not finite [s], NaN if never; `smallest` distance of two robots [m],
     their `pair` of indices and its `closest_time` [s]; number of `violations` of the avoidance radius"""
     blocks: Records
-    """(R, blocks): as in `sim.results.records.BlockResult`"""
+    """(R, blocks): as in `sim.results.records.BlockResult`; root mean squares of the amplitude in the last three sixths of the
+    run [m]: `sooner`, `earlier` and `level` (`sim.results.ending.levels`)"""
     robots: Records
     """(R, robots): as in `sim.results.records.TorqueResult`"""
     links: Records
@@ -61,6 +64,13 @@ class BatchRuns:
 def fractions(plan: Plan) -> tuple[float, ...]:
     """Returns the fractions of the error at the start whose settling times are measured."""
     return (*FRACTIONS, *(claim.band for claim in plan.claims))
+
+
+def late_sixths_ns(plan: Plan) -> tuple[int, int, int]:
+    """Returns when each of the last three sixths of a run begins [ns]."""
+    common_ns = lcm(*[robot.period_ns for robot in plan.robots])
+    last_ns = plan.duration_ns // common_ns * common_ns
+    return last_ns * 3 // 6, last_ns * 4 // 6, last_ns * 5 // 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +118,7 @@ def outcomes(
     return BatchRuns(
         plan,
         runs,
-        _blocks(of_blocks, marks, settling),
+        _blocks(of_blocks, marks, settling, _instants_of_sixths(plan, common_ns)),
         _robots(plan, of_robots),
         _links(plan, of_links),
         settling.claims(),
@@ -172,7 +182,16 @@ class _Settling:
         return passed
 
 
-def _blocks(of_blocks: NDArray[np.float64], marks: NDArray[np.int64], settling: _Settling) -> Records:
+def _instants_of_sixths(plan: Plan, common_ns: int) -> dict[str, int]:
+    """Returns the number of instants in each of the last three sixths of a run."""
+    first = [-(-begin_ns // common_ns) for begin_ns in late_sixths_ns(plan)]
+    counts = np.diff([*first, plan.duration_ns // common_ns + 1])
+    return dict(zip(("sooner", "earlier", "level"), counts.tolist(), strict=True))
+
+
+def _blocks(
+    of_blocks: NDArray[np.float64], marks: NDArray[np.int64], settling: _Settling, sixths: dict[str, int]
+) -> Records:
     blocks = np.zeros(of_blocks.shape[:2], dtype=BLOCK_FIELDS)
     places = {
         "start_error": r.M_START,
@@ -185,6 +204,9 @@ def _blocks(of_blocks: NDArray[np.float64], marks: NDArray[np.int64], settling: 
     for name, place in places.items():
         blocks[name] = _finite(of_blocks[:, :, place])
     blocks["peak_time"] = marks[:, :, r.M_PEAK_NS] / 1e9
+    for place, (name, instants) in enumerate(sixths.items(), r.M_SOONER):
+        squares = np.where(marks[:, :, r.M_FINITE] == 1, of_blocks[:, :, place], np.nan)
+        blocks[name] = _finite(np.sqrt(squares / max(1, instants)))
     blocks["settling_2"], blocks["settling_5"] = settling.seconds(0), settling.seconds(1)
     return blocks
 

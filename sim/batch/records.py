@@ -23,9 +23,12 @@ def _record(wholes: str, reals: str) -> np.dtype[np.void]:
 RUN: Final = _record(
     # instants [ns]; whether robots avoid each other; law and trajectory (below), the trajectory's numbers in `table`
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
-    # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and those of robots before, and their
-    # order (potential); square of the smallest distance; the pair and its instant, then the number of violations
-    "due_at places_at before_at order_at distance_at closest_at "
+    # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and their velocities; places of robots
+    # before, and their order (potential); square of the smallest distance; the pair and its instant, then the number of
+    # violations
+    "due_at places_at rates_at before_at order_at distance_at closest_at "
+    # from when on amplitudes are summed up: the last three sixths of the run [ns]
+    "sooner_ns earlier_ns last_ns "
     # whether late states are compared with the reference of their own time
     "of_message",
     # `ahead`: how far the feed-forward is led [s]
@@ -57,7 +60,8 @@ BLOCK: Final = _record(
     # number of its rows; gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in
     # `indices`, values in `table`
     "rows diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
-    "sigma ahead period bound",
+    # α and 1/ω² of its amplitude (sim.results.rates), 0 if it does not oscillate
+    "sigma ahead period bound alpha per_omega_squared",
 )
 STREAM: Final = _record(
     # a role's messages on one channel: the last mask + 1 of them, of `length` values each from `at` in `real`; in `whole` their
@@ -111,8 +115,9 @@ FAR: Final = 1 << 62
 """An instant that never comes [ns]"""
 
 # Places in a block's part of `real` and of `whole`.
-M_LAST, M_PEAK, M_START, M_ISE, M_IAE, M_ITAE = range(6)
-BLOCK_REALS: Final = 6
+M_LAST, M_PEAK, M_START, M_ISE, M_IAE, M_ITAE, M_SOONER, M_EARLIER, M_FINAL = range(9)
+"""... sums of the squared amplitude in each of the last three sixths of the run"""
+BLOCK_REALS: Final = 9
 M_PEAK_NS, M_FINITE, M_OUT_FLOOR = range(3)
 BLOCK_WHOLES: Final = 3
 """After these comes for each fraction the last instant at which |e| was outside of it [ns]"""

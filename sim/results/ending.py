@@ -81,7 +81,7 @@ class Ending:
 
 
 @dataclass(frozen=True, slots=True)
-class _Reference:
+class Reference:
     """The velocity of the desired trajectory."""
 
     velocity: Array
@@ -97,22 +97,48 @@ def endings(plan: Plan, blocks: Blocks, links: Sequence[LinkCounts]) -> tuple[En
     times_ns = blocks.times_ns
     if not len(times_ns):
         return tuple(Ending("too short", "was never recorded", None, 0.0, 0.0, None) for _ in blocks.series)
-    reference = _reference(blocks)
-    jitter, lags = loop_jitter(plan, links), lag_times(plan, links)
+    centroid = blocks.series[-1]
+    reference = reference_of(centroid.rate - centroid.error_rate, times_ns)
+    lags, floors = lag_times(plan, links), floors_of(plan, reference, links)
     found = []
     for series in blocks.series:
         lag = float(np.linalg.norm(lags[series.block.name]))
-        unknown = reference.speed * (OVER * lag + jitter)
-        floor = max(plan.health.floor, unknown, series.block.sigma * reference.jump)
+        floor = floors[series.block.name]
         wait_ns = dwell_ns(series.block, plan.health.dwell)
         found.append(_ending(series, times_ns, reference.velocity, floor, lag, plan.health.growth, wait_ns))
     return tuple(found)
 
 
-def _reference(blocks: Blocks) -> _Reference:
-    centroid = blocks.series[-1]
-    velocity = centroid.rate - centroid.error_rate
-    late = blocks.times_ns >= _part_ns(blocks.times_ns, 4)
+def floors_of(plan: Plan, reference: Reference, links: Sequence[LinkCounts]) -> dict[str, float]:
+    """Returns for each block the amplitude up to which it is not judged [m]."""
+    jitter, lags = loop_jitter(plan, links), lag_times(plan, links)
+    floors = {}
+    for block in plan.blocks:
+        unknown = reference.speed * (OVER * float(np.linalg.norm(lags[block.name])) + jitter)
+        floors[block.name] = max(plan.health.floor, unknown, block.sigma * reference.jump)
+    return floors
+
+
+def is_too_short(times_ns: NDArray[np.int64], wait_ns: int) -> bool:
+    """Returns whether a run is too short to judge a block with this dwell time."""
+    return int(times_ns[-1]) - int(times_ns[0]) < 3 * wait_ns or not _sixth(times_ns, 4).any()
+
+
+def levels(sizes: Array, times_ns: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Returns the root mean square of amplitudes, both (T,), in the last three sixths of the run, in their order."""
+    with np.errstate(all="ignore"):
+        sooner, earlier = (_rms(sizes[_sixth(times_ns, number)]) for number in (3, 4))
+        return sooner, earlier, _rms(sizes[times_ns >= _part_ns(times_ns, 5)])
+
+
+def growth_of(level: float, earlier: float) -> float:
+    """Returns the ratio of two amplitudes; 1 if both are zero but for rounding."""
+    return level / earlier if earlier > 0 else 1.0 if level <= ROUNDING else float("inf")
+
+
+def reference_of(velocity: Array, times_ns: NDArray[np.int64]) -> Reference:
+    """Returns what judging needs of the desired velocity (T, 2) at the instants `times_ns`, (T,)."""
+    late = times_ns >= _part_ns(times_ns, 4)
     steps = np.diff(velocity[late], axis=0)
     # A jump is the change of velocity in one step, less the larger one of the changes in the steps beside it.
     jump = 0.0
@@ -122,7 +148,7 @@ def _reference(blocks: Blocks) -> _Reference:
         jump = float(np.max(sizes - beside, initial=0.0))
     with np.errstate(all="ignore"):
         speed = float(np.nanmax(np.linalg.norm(velocity[late], axis=1), initial=0.0))
-    return _Reference(velocity, speed if np.isfinite(speed) else 0.0, jump if np.isfinite(jump) else 0.0)
+    return Reference(velocity, speed if np.isfinite(speed) else 0.0, jump if np.isfinite(jump) else 0.0)
 
 
 def _part_ns(times_ns: NDArray[np.int64], sixths: int) -> int:
@@ -147,20 +173,17 @@ def _ending(
     if not np.isfinite(series.norm).all():
         return Ending("not finite", "is not finite", None, float("nan"), floor, None)
     sizes = amplitude(series)
-    sooner, before = (_sixth(times_ns, number) for number in (3, 4))
-    last = times_ns >= _part_ns(times_ns, 5)
+    before, last = _sixth(times_ns, 4), times_ns >= _part_ns(times_ns, 5)
+    sooner, earlier, level = levels(sizes, times_ns)
     with np.errstate(all="ignore"):
-        fit = decay(times_ns, sizes, _rms(sizes[last]))
-    if int(times_ns[-1]) - int(times_ns[0]) < 3 * wait_ns or not before.any():
+        fit = decay(times_ns, sizes, level)
+    if is_too_short(times_ns, wait_ns):
         text = f"cannot be judged: a third of the run is shorter than its dwell time, {wait_ns / 1e9:.4g} s"
-        return Ending("too short", text, None, _rms(sizes[last]), floor, fit)
-    earlier, level = _rms(sizes[before]), _rms(sizes[last])
-    growth = level / earlier if earlier > 0 else 1.0 if level <= ROUNDING else float("inf")
+        return Ending("too short", text, None, level, floor, fit)
+    growth = growth_of(level, earlier)
 
     begun = start_error(series, times_ns) or 0.0
-    spared = ""
-    if growth > bound:
-        spared = _spared(level, earlier, _rms(sizes[sooner]), floor, begun, bound)
+    spared = spared_because(level, earlier, sooner, floor, begun, bound) if growth > bound else ""
 
     def ended(kind: Kind, text: str) -> Ending:
         why = "" if kind == "grows" or growth <= bound else spared or f"it {text}"
@@ -194,7 +217,7 @@ def _ending(
     return ended("steady error", f"stays at about {mean:.3g} m{beside}")
 
 
-def _spared(level: float, earlier: float, sooner: float, floor: float, begun: float, bound: float) -> str:
+def spared_because(level: float, earlier: float, sooner: float, floor: float, begun: float, bound: float) -> str:
     """Returns why an error that grew by more than `bound` does not count as growing; empty if it counts.
 
     `level`, `earlier` and `sooner` are its amplitudes [m] in the last sixth of the run, in the one before, and in the one

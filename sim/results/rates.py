@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from echelon.plan.plan import BlockPlan
 from echelon.sim.results.block_series import BlockSeries
 from echelon.sim.results.settling import ROUNDING
 from echelon.sim.results.trace import Array
@@ -35,14 +36,18 @@ class Fit:
     r_squared: float
 
 
-def amplitude(series: BlockSeries) -> Array:
-    """Returns the amplitude a of a block's error [m], (T,)."""
-    block = series.block
+def oscillation(block: BlockPlan) -> tuple[float, float]:
+    """Returns α [1/s] and ω² [1/s²] of a block alone; ω² = 0 if it has no variables."""
     if not block.size:
-        return series.norm
+        return 0.0, 0.0
     K_1 = float(np.trace(block.k1)) / block.size / block.sigma**2
     alpha = float(np.trace(block.k2)) / block.size / block.sigma / 2
-    omega_squared = K_1 - alpha**2
+    return alpha, K_1 - alpha**2
+
+
+def amplitude(series: BlockSeries) -> Array:
+    """Returns the amplitude a of a block's error [m], (T,)."""
+    alpha, omega_squared = oscillation(series.block)
     if omega_squared <= 0:
         return series.norm
     with np.errstate(all="ignore"):

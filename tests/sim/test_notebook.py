@@ -12,7 +12,7 @@ from nbclient import NotebookClient
 
 import echelon
 from echelon.messages import STATE_FIELDS
-from echelon.sim.notebook import toml_value
+from echelon.scenario.toml_text import toml_value
 from support.runs import ROOT, SCENARIOS, plan_of, summary_of, trace_of
 from support.runs import echelon as command
 

@@ -13,6 +13,9 @@ from echelon.plan.plan import Plan
 from echelon.sim.batch.batch import run_many
 from echelon.sim.batch.outcomes import BatchRuns
 from echelon.sim.engines.in_process import Engine
+from echelon.sim.results.block_series import block_series
+from echelon.sim.results.ending import levels
+from echelon.sim.results.rates import amplitude
 from echelon.sim.results.records import RunFacts, Summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace, TraceBuilder
@@ -156,7 +159,7 @@ def test_links_do_the_same(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_measures_are_those_of_a_summary(case: str) -> None:
-    _, summary, runs = both(case)
+    trace, summary, runs = both(case)
     for block, found in zip(summary.blocks, runs.blocks[0], strict=True):
         same(found, block, ("settling_2", "settling_5", "peak_time"), rtol=0)
         if case != "diverges":
@@ -164,6 +167,10 @@ def test_measures_are_those_of_a_summary(case: str) -> None:
         else:
             assert np.isnan(found["residual"]) == (block.residual is None)
     if case != "diverges":
+        blocks = block_series(trace)
+        for series, found in zip(blocks.series, runs.blocks[0], strict=True):
+            of_sixths = levels(amplitude(series), blocks.times_ns)
+            np.testing.assert_allclose([found[name] for name in ("sooner", "earlier", "level")], of_sixths, 1e-9, 1e-12)
         for robot, found in zip(summary.torque, runs.robots[0], strict=True):
             same(found, robot, ("rms", "peak", "saturation_share", "saturated_after_first_second"))
         same(runs.runs[0], summary.distance, ("smallest",))

@@ -37,7 +37,7 @@ RUN_MEASURES: Final = (
     Column("smallest_distance", "m", "smallest distance of two robots"),
     Column("violations", "", "number of violations of the avoidance radius", whole=True),
     Column("saturation", "", "largest share of the time in which limits of a robot acted"),
-    Column("peak_torque", "N m", "largest torque of a wheel"),
+    Column("peak_torque", "N m", "largest torque of a wheel; empty if a state is not finite"),
 )
 BLOCK_MEASURES: Final = (
     Column("start_error.B", "m", "error that the block starts with"),

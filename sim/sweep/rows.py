@@ -35,6 +35,7 @@ def rows_of_batch(runs: BatchRuns) -> Rows:
     """Returns the rows of the runs of a batch."""
     plan, words = runs.plan, words_of(runs)
     lost_at = runs.runs["diverged"]
+    lost = ~np.isnan(lost_at)
     rows: Rows = {
         "verdict": [word.word for word in words],
         "holds": [int(word.word != "FAILS") for word in words],
@@ -43,9 +44,8 @@ def rows_of_batch(runs: BatchRuns) -> Rows:
         "smallest_distance": runs.runs["smallest"].tolist(),
         "violations": runs.runs["violations"].tolist(),
         "saturation": runs.robots["saturation_share"].max(axis=1).tolist(),
-        "peak_torque": runs.robots["peak"].max(axis=1).tolist(),
+        "peak_torque": np.where(lost, np.nan, runs.robots["peak"].max(axis=1)).tolist(),
     }
-    lost = ~np.isnan(lost_at)
     for number, block in enumerate(plan.blocks):
         if not block.size:
             continue
@@ -88,7 +88,7 @@ def row_of_run(trace: Trace, summary: Summary) -> Rows:
         "smallest_distance": _number(summary.distance.smallest),
         "violations": len(summary.distance.violations),
         "saturation": max((_number(each.saturation_share) for each in torques), default=nan),
-        "peak_torque": max((_number(each.peak) for each in torques), default=nan),
+        "peak_torque": nan if isfinite(lost_at) else max((_number(each.peak) for each in torques), default=nan),
     }
     late = {}
     blocks = block_series(trace)

@@ -57,6 +57,12 @@ def powers_of(plan: Plan, source: int, channel: Channel) -> tuple[int, ...]:
     return accelerations + (1,) * (ReferenceLayout.of(plan, node).size - len(accelerations))
 
 
+def moved(memory: Array, a: Array, T: float) -> Array:
+    """Returns positions and velocities, (4, runs), after a time T [s] under accelerations a, (2, runs)."""
+    position, velocity = memory[:2], memory[2:]
+    return np.vstack((position + T * velocity + T**2 / 2 * a, velocity + T * a))
+
+
 class LinearRobot:
     """A robot as a double integrator: it moves under the acceleration of its last command.
 
@@ -102,9 +108,7 @@ class LinearRobot:
         """Moves through a period; each acceleration holds from its instant after the beginning of the period [ns]."""
         ends = [after_ns for after_ns, _ in accelerations[1:]] + [self._period_ns]
         for (after_ns, a), end_ns in zip(accelerations, ends, strict=True):
-            T = (end_ns - after_ns) * 1e-9
-            position, velocity = self.memory[:2], self.memory[2:]
-            self.memory = np.vstack((position + T * velocity + T**2 / 2 * a, velocity + T * a))
+            self.memory = moved(self.memory, a, (end_ns - after_ns) * 1e-9)
         return {}
 
 
@@ -120,8 +124,10 @@ class LinearNode:
         self.powers = (-1,) * size
         self.memory: Array = np.zeros((size, 0))
         """The integrals q of the law's integral action"""
-        self._s: Array = np.zeros((0, 0))
-        self._state: Array = np.zeros((0, 0))
+        self.s: Array = np.zeros((len(MOTION) * len(node.children), 0))
+        """Positions and velocities of its children at its last upward act"""
+        self.state: Array = np.zeros((self._layout.state.size, 0))
+        """Its GROUP_STATE of that act"""
         robots = len(plan.robots)
         children = tuple(
             Input(child, Channel.STATE if child < robots else Channel.GROUP_STATE) for child in node.children
@@ -148,9 +154,9 @@ class LinearNode:
     def _gather(self, acts: Heard) -> Said:
         """Takes the children's states; returns the group's."""
         ((_, heard),) = acts
-        self._s = s = np.vstack([values[CENTROID] for values in heard])
+        self.s = s = np.vstack([values[CENTROID] for values in heard])
         own, layout = self._law.up @ s, self._layout.state
-        self._state = state = np.empty((layout.size, s.shape[1]))
+        self.state = state = np.empty((layout.size, s.shape[1]))
         state[layout.centroid] = own[: len(MOTION)]
         if self._coupled:
             state[layout.own_rates] = own[len(MOTION) :]
@@ -167,12 +173,12 @@ class LinearNode:
         ((_, heard),) = acts
         mine = self._layout.mine
         if mine is None:
-            c, rates = np.zeros((6, self._s.shape[1])), self._state[self._layout.state.rates]
+            c, rates = np.zeros((6, self.s.shape[1])), self.state[self._layout.state.rates]
         else:
             c, rates = heard[0][mine.acceleration], heard[0][mine.rates]
-        accelerations = self._law.down @ np.vstack((self._s, c, rates))
+        accelerations = self._law.down @ np.vstack((self.s, c, rates))
         if self._blocks is not None:
-            further, self.memory = self._blocks(self._s, self.memory)
+            further, self.memory = self._blocks(self.s, self.memory)
             accelerations += further
         said = {}
         if self._layout.command is not None:

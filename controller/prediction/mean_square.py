@@ -1,0 +1,181 @@
+"""How much loss a run bears in the mean square (docs/architecture.md, 2.11).
+
+The second moment X = E[x xᵀ] of the linear run with losses follows a linear map L.  Errors vanish in the mean square if and
+only if the spectral radius of L is below 1 (Costa, Fragoso and Marques, *Discrete-Time Markov Jump Linear Systems*, 2005).
+
+A run that holds says nothing about the mean square: near the boundary E|x|² grows while most runs decay.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import inf, log
+from typing import Final, Literal
+
+import numpy as np
+
+from echelon.controller.prediction.gains import PredictionError
+from echelon.controller.prediction.linear_run import ruled_links
+from echelon.controller.prediction.random_run import Part, RandomRun
+from echelon.controller.prediction.random_steps import Chances, moment
+from echelon.controller.prediction.second_moment import SecondMoment
+from echelon.messages import Channel
+from echelon.plan.delay_tables import Bursts
+from echelon.plan.plan import Array, LinkPlan, Plan
+
+TRIED: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
+"""Losses that are tried one after the other; between the last stable one and the first that is not, a finer search follows"""
+FINE: Final = 1e-5
+"""How closely the boundary is found"""
+ALIKE: Final = 1e-9
+"""Relative difference up to which numbers of two parts count as equal"""
+ALIKE_AT: Final = 0.3
+"""Loss at which parts are compared"""
+LARGEST: Final = 700
+"""Number of registers of the largest part; a larger one is refused"""
+
+
+@dataclass(frozen=True, slots=True)
+class LossBoundary:
+    """How many of their messages links may lose in the mean square."""
+
+    loss: float | None
+    """Every loss that was tried up to this one is stable; None: even without loss on these links the run is unstable"""
+    ends: Literal["unstable", "limit"]
+    """Why it is not more: more is unstable, or more has not been tried"""
+    burst: float | None
+    """Mean length of the bursts of losses [messages]; None: each message is lost by itself"""
+    radius: float
+    """Spectral radius of L at the plan's own mean loss: E|x|² is multiplied by it in each hyperperiod"""
+    estimate: bool = False
+    """True if the boundary is an estimate from random runs; False if it is exact"""
+
+
+def mean_square(plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float | None = None) -> LossBoundary:
+    """Returns how many messages links of a plan may lose; other links are as in the plan.  `links` are some of `plan.links`, or
+    the channel of all that rules apply to.
+
+    With `burst` they lose messages in bursts of this mean length, none between bursts and all within them (Gilbert).
+
+    Raises PredictionError if nothing exact can be said of the plan, ValueError if there are no such links."""
+    losses = Losses(plan, _places(plan, links), burst)
+    at_own = losses.radius(losses.own)
+    if losses.gain(0.0) >= 1:
+        return LossBoundary(None, "unstable", burst, at_own)
+    low = 0.0
+    for high in (each for each in TRIED if each < losses.most):
+        if losses.gain(high) >= 1:
+            return LossBoundary(_edge(losses.gain, low, high), "unstable", burst, at_own)
+        low = high
+    return LossBoundary(low, "limit", burst, at_own)
+
+
+class Losses:
+    """The linear run of a plan, with the loss of some links as a variable."""
+
+    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None) -> None:
+        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.
+
+        Raises PredictionError if nothing exact can be said."""
+        self._varied, self._burst = sorted(varied), burst
+        self._others = np.array([link.loss for link in plan.links])
+        self.own = float(self._others[self._varied].max(initial=0.0))
+        """The largest loss of these links in the plan"""
+        self.most = 1.0 if burst is None else burst / (1 + burst)
+        """The loss that they cannot reach"""
+        lossy, chained = {*np.flatnonzero(self._others).tolist(), *self._varied}, list[int]()
+        if burst is not None:
+            lossy, chained = lossy - {*self._varied}, self._varied
+        in_bursts = [at for at in lossy - {*self._varied} if plan.links[at].bursts]
+        check_together(plan, [*in_bursts, *chained])
+        self._chain = None
+        if in_bursts:
+            self._chain = of_bursts(plan.links[in_bursts[0]])
+            lossy, chained = lossy - {*in_bursts}, in_bursts
+        parts = RandomRun(plan, lossy, chained).parts()
+        if (largest := max(len(part.registers) for part in parts)) > LARGEST:
+            raise PredictionError(f"{largest} numbers act on each other, too many to compute losses with")
+        self._parts = different(parts, self._chances(ALIKE_AT))
+
+    def gain(self, loss: float) -> float:
+        """Returns a number that is below 1 if and only if errors vanish in the mean square."""
+        return max(SecondMoment(part, self._chances(loss)).gain() for part in self._parts)
+
+    def radius(self, loss: float) -> float:
+        """Returns the spectral radius of L."""
+        return max(SecondMoment(part, self._chances(loss)).radius() for part in self._parts)
+
+    def _chances(self, loss: float) -> Chances:
+        if self._burst is not None:
+            return Chances.of(self._others, gilbert(loss, self._burst))
+        losses = self._others.copy()
+        losses[self._varied] = loss
+        return Chances.of(losses, self._chain)
+
+
+def check_together(plan: Plan, chained: Sequence[int]) -> None:
+    """Raises PredictionError if links with bursts do not lose the same messages: each would have modes of its own."""
+    links = [plan.links[at] for at in chained]
+    if len(links) > 1 and (
+        len({(link.source, link.channel, link.bursts) for link in links}) > 1
+        or not all(link.loss_of_message for link in links)
+    ):
+        raise PredictionError(
+            "several links have bursts of their own: their boundary is exact for one link, or for one broadcast that is "
+            "lost for all receivers at once"
+        )
+
+
+def gilbert(loss: float, burst: float) -> Array:
+    """Returns the chain (`Chances.chain`) of a link that loses all messages in bad times and none in good ones; `burst` is the
+    mean length of a bad time [messages], `loss` the share of messages that are lost, below burst/(1 + burst)."""
+    to_good = 1 / burst
+    return _chain(Bursts(to_bad=to_good * loss / (1 - loss), to_good=to_good, loss_good=0.0, loss_bad=1.0))
+
+
+def of_bursts(link: LinkPlan) -> Array:
+    """Returns the chain of a link with bursts: its modes are good and bad; with outcome 0 a message comes."""
+    assert link.bursts is not None
+    return _chain(link.bursts)
+
+
+def _chain(bursts: Bursts) -> Array:
+    step = np.array([[1 - bursts.to_bad, bursts.to_bad], [bursts.to_good, 1 - bursts.to_good]])
+    lost = np.array([[bursts.loss_good], [bursts.loss_bad]])
+    return np.stack([(1 - lost) * step, lost * step])
+
+
+def different(parts: Sequence[Part], chances: Chances) -> list[Part]:
+    """Returns parts, each of those that are alike once: parts that take an X of random numbers to the same X."""
+    found: list[tuple[Part, Array]] = []
+    for part in parts:
+        size = len(part.registers)
+        X = np.random.default_rng(size).normal(size=(chances.modes, size, size))
+        after = moment(part.steps, X, chances)
+        if not any(other.shape == after.shape and np.allclose(other, after, rtol=ALIKE, atol=0) for _, other in found):
+            found.append((part, after))
+    return [part for part, _ in found]
+
+
+def _edge(gain: Callable[[float], float], low: float, high: float) -> float:
+    """Returns where a gain passes 1 between a loss where it is below 1 and one where it is not."""
+    at_low, at_high = gain(low), gain(high)
+    while high - low > FINE:
+        share = 0.5
+        if at_low > 0 and at_high < inf:
+            share = min(max(log(at_low) / (log(at_low) - log(at_high)), 0.05), 0.95)
+        middle = low + share * (high - low)
+        at = gain(middle)
+        if at < 1:
+            low, at_low = middle, at
+        else:
+            high, at_high = middle, at
+    return low
+
+
+def _places(plan: Plan, links: Sequence[LinkPlan] | Channel) -> list[int]:
+    """Returns the places of links in `plan.links`."""
+    some = ruled_links(plan, links) if isinstance(links, Channel) else links
+    found = [at for at, link in enumerate(plan.links) if any(link is each for each in some)]
+    if not found:
+        raise ValueError("there are no such links in the plan")
+    return found

@@ -1,0 +1,399 @@
+"""Steps of a linear run with random links: how its state changes, and how the second moment of its state does
+(docs/architecture.md, 2.11).
+
+The state x are numbers in *registers*: positions and velocities, messages on their way, and for each link the value in use at
+its receiver.  A run is a sequence of steps.  Each takes x, or the second moment X = E[x xᵀ], through a part of a hyperperiod:
+
+    step      x⁺                                                   X⁺
+    --------  ---------------------------------------------------  -------------------------------------------------
+    Linear    F x                                                  F X Fᵀ
+    Choice    each link by itself takes a message, x_d ← x_s,      X̄ + p (1 - p) Δ X Δᵀ for each link, X̄ = C X Cᵀ,
+              or loses it, with the probability p                  C = E[x⁺ of x],  Δ = x_d ← x_s - x_d
+    Jump      one link whose chances depend on a Markov chain      for each mode: the sum over modes it comes from
+    Window    if all of its messages come, `early`, else `late`    late(all) - late(came) + early(came)
+
+Losses of different links are independent, as are the losses of one link at different times; so X⁺ depends on X alone, and is
+exact.  With a chain there is an X for each of its modes, E[x xᵀ; mode].
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, Self
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array
+
+from echelon.plan.plan import Array
+
+Bits = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+DENSE: Final = 0.15
+"""Share of numbers that are not zero from which a matrix is multiplied as a dense one"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chances:
+    """The probabilities of a run."""
+
+    losses: Array
+    """Loss of each kind of link, (kinds,)"""
+    chain: Array
+    """Probabilities of the Markov chain, (outcomes, modes, modes): that mode i is followed by mode j while message number
+    `outcome` of a `Jump` is taken; with the last outcome no message is"""
+
+    @classmethod
+    def of(cls, losses: Array, chain: Array | None = None) -> Self:
+        """Returns chances; without a chain there is one mode."""
+        return cls(losses, np.ones((1, 1, 1)) if chain is None else chain)
+
+    @property
+    def modes(self) -> int:
+        """Number of modes of the chain."""
+        return int(self.chain.shape[1])
+
+    def stationary(self) -> Array:
+        """Returns the stationary probabilities of the modes, (modes,)."""
+        step = self.chain.sum(axis=0)
+        equations = np.vstack([step.T - np.eye(self.modes), np.ones(self.modes)])
+        found = np.linalg.lstsq(equations, np.r_[np.zeros(self.modes), 1.0], rcond=None)[0]
+        return np.asarray(found)
+
+
+class Step(Protocol):
+    """A step of a run; registers are numbered from 0 on."""
+
+    def needs(self, live: Bits) -> Bits:
+        """Returns the registers that matter before the step, if those in `live` matter after it."""
+
+    def edges(self) -> Iterable[tuple[Indices, Indices]]:
+        """Yields pairs of registers of which one acts on the other."""
+
+    def cut(self, live: Bits) -> tuple[list["Step"], Bits]:
+        """Returns the step for the registers alone that matter, and which matter before it."""
+
+    def moment(self, X: Array, chances: Chances) -> Array:
+        """Returns the second moments after the step; `X` is (modes, registers, registers)."""
+
+    def mean(self, x: Array, chances: Chances) -> Array:
+        """Returns the means of states after the step; `x` is (modes, registers, runs)."""
+
+    def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
+        """Returns the states and modes of runs after the step, and in which runs all messages came; `x` is (registers,
+        runs)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """A linear map F."""
+
+    F: csr_array
+    full: Array | None = None
+    """F as a full matrix, if that is faster"""
+
+    @classmethod
+    def of(cls, F: csr_array) -> Self:
+        """Returns the map in the form that is faster."""
+        return cls(F, F.toarray() if F.nnz > DENSE * F.shape[0] * F.shape[1] else None)
+
+    def needs(self, live: Bits) -> Bits:
+        found = np.zeros(self.F.shape[1], dtype=bool)
+        found[self.F[live].indices] = True
+        return found
+
+    def edges(self) -> Iterable[tuple[Indices, Indices]]:
+        rows, columns = self.F.nonzero()
+        yield rows.astype(np.intp), columns.astype(np.intp)
+
+    def cut(self, live: Bits) -> tuple[list["Step"], Bits]:
+        before = self.needs(live)
+        return [Linear(csr_array(self.F[live][:, before]))], before
+
+    def moment(self, X: Array, chances: Chances) -> Array:
+        if self.full is not None:
+            return np.asarray(self.full @ X @ self.full.T)
+        return np.stack([(self.F @ (self.F @ each).T).T for each in X])
+
+    def mean(self, x: Array, chances: Chances) -> Array:
+        return np.stack([self.F @ each for each in x])
+
+    def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
+        return self.F @ x, modes, np.ones(x.shape[1], dtype=bool)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """Messages that are lost or not, each by itself.  `dest`, `source` are the registers in use and those of the messages;
+    those with the same number in `draw` share their fate.  `kind` are the kinds of link of each draw.
+
+    `came`: X is counted only as far as all messages come."""
+
+    dest: Indices
+    source: Indices
+    draw: Indices
+    kind: Indices
+    came: bool = False
+    pairs: tuple[Indices, Indices] = (np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
+    """Pairs of places in `dest` that share their fate"""
+
+    @classmethod
+    def of(cls, dest: Indices, source: Indices, draw: Indices, kind: Indices, *, came: bool = False) -> Self:
+        """Returns the step."""
+        one, other = np.nonzero(draw[:, None] == draw)
+        return cls(dest, source, draw, kind, came, (one, other))
+
+    def needs(self, live: Bits) -> Bits:
+        found = live.copy()
+        found[self.source[live[self.dest]]] = True
+        return found
+
+    def edges(self) -> Iterable[tuple[Indices, Indices]]:
+        yield self.dest, self.source
+
+    def cut(self, live: Bits) -> tuple[list[Step], Bits]:
+        before = self.needs(live)
+        number, used = np.cumsum(before) - 1, live[self.dest]
+        dest, source = number[self.dest[used]], number[self.source[used]]
+        cut = Choice.of(dest, source, self.draw[used], self.kind, came=self.came)
+        return [cut, _prune(before, live)], before
+
+    def moment(self, X: Array, chances: Chances) -> Array:
+        loss = chances.losses[self.kind]
+        if self.came:
+            X = float(np.prod(1 - loss)) * X
+            X[:, self.dest] = X[:, self.source]
+            X[:, :, self.dest] = X[:, :, self.source]
+            return X
+        d, s, p = self.dest, self.source, loss[self.draw]
+        found = X.copy()
+        found[:, d] = p[:, None] * X[:, d] + (1 - p)[:, None] * X[:, s]
+        found[:, :, d] = p * found[:, :, d] + (1 - p) * found[:, :, s]
+        i, j = self.pairs
+        q = p[i]
+        found[:, d[i], d[j]] += (q * (1 - q)) * (
+            X[:, s[i], s[j]] - X[:, s[i], d[j]] - X[:, d[i], s[j]] + X[:, d[i], d[j]]
+        )
+        return found
+
+    def mean(self, x: Array, chances: Chances) -> Array:
+        loss = chances.losses[self.kind]
+        if self.came:
+            found = float(np.prod(1 - loss)) * x
+            found[:, self.dest] = found[:, self.source]
+            return found
+        p, found = loss[self.draw][:, None], x.copy()
+        found[:, self.dest] = p * x[:, self.dest] + (1 - p) * x[:, self.source]
+        return found
+
+    def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
+        comes = random.random((len(self.kind), x.shape[1])) >= chances.losses[self.kind][:, None]
+        x = x.copy()
+        x[self.dest] = np.where(comes[self.draw], x[self.source], x[self.dest])
+        return x, modes, np.all(comes, axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Jump:
+    """A step of the Markov chain.  With outcome k the registers `dest` take those of `sources[k]`; with the last outcome, one
+    more than there are sources, they keep what they have.
+
+    `came`: X is counted only as far as a message is taken."""
+
+    dest: Indices
+    sources: tuple[Indices, ...]
+    came: bool = False
+
+    def needs(self, live: Bits) -> Bits:
+        found = live.copy()
+        for source in self.sources:
+            found[source[live[self.dest]]] = True
+        return found
+
+    def edges(self) -> Iterable[tuple[Indices, Indices]]:
+        for source in self.sources:
+            yield self.dest, source
+
+    def cut(self, live: Bits) -> tuple[list[Step], Bits]:
+        before = self.needs(live)
+        number, used = np.cumsum(before) - 1, live[self.dest]
+        cut = Jump(number[self.dest[used]], tuple(number[source[used]] for source in self.sources), self.came)
+        return [cut, _prune(before, live)], before
+
+    def moment(self, X: Array, chances: Chances) -> Array:
+        chain = chances.chain
+        found = np.zeros_like(X) if self.came else np.einsum("ij,iab->jab", chain[-1], X)
+        for source, step in zip(self.sources, chain[:-1], strict=True):
+            taken = np.einsum("ij,iab->jab", step, X)
+            taken[:, self.dest] = taken[:, source]
+            taken[:, :, self.dest] = taken[:, :, source]
+            found += taken
+        return found
+
+    def mean(self, x: Array, chances: Chances) -> Array:
+        chain = chances.chain
+        found = np.zeros_like(x) if self.came else np.einsum("ij,iab->jab", chain[-1], x)
+        for source, step in zip(self.sources, chain[:-1], strict=True):
+            taken = np.einsum("ij,iab->jab", step, x)
+            taken[:, self.dest] = taken[:, source]
+            found += taken
+        return found
+
+    def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
+        outcomes, count = len(self.sources) + 1, chances.modes
+        edges = np.cumsum(chances.chain.transpose(1, 0, 2).reshape(count, -1), axis=1)[modes]
+        drawn = np.minimum((random.random((len(modes), 1)) >= edges).sum(axis=1), outcomes * count - 1)
+        outcome, x = drawn // count, x.copy()
+        for number, source in enumerate(self.sources):
+            x[self.dest] = np.where(outcome == number, x[source], x[self.dest])
+        return x, drawn % count, outcome < outcomes - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The period of event-driven nodes: `up` are the steps until all that is waited for has come; if it comes, `early` follows,
+    else `late`.  `came` are the steps of `up` as far as all messages come."""
+
+    up: tuple[Step, ...]
+    came: tuple[Step, ...]
+    early: tuple[Step, ...]
+    late: tuple[Step, ...]
+
+    def needs(self, live: Bits) -> Bits:
+        return needs(self.up, needs(self.early, live) | needs(self.late, live))
+
+    def edges(self) -> Iterable[tuple[Indices, Indices]]:
+        for part in (self.up, self.early, self.late):
+            for step in part:
+                yield from step.edges()
+
+    def cut(self, live: Bits) -> tuple[list[Step], Bits]:
+        middle = needs(self.early, live) | needs(self.late, live)
+        before = needs(self.up, middle)
+        early, late = (forced(part, middle, live) for part in (self.early, self.late))
+        up, came = (forced(part, before, middle) for part in (self.up, self.came))
+        return [Window(up, came, early, late)], before
+
+    def moment(self, X: Array, chances: Chances) -> Array:
+        came = moment(self.came, X, chances)
+        missed = moment(self.up, X, chances) - came
+        return moment(self.late, missed, chances) + moment(self.early, came, chances)
+
+    def mean(self, x: Array, chances: Chances) -> Array:
+        came = mean(self.came, x, chances)
+        missed = mean(self.up, x, chances) - came
+        return mean(self.late, missed, chances) + mean(self.early, came, chances)
+
+    def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
+        x, modes, came = sample(self.up, x, modes, chances, random)
+        early, _, _ = sample(self.early, x, modes, chances, random)
+        late, _, _ = sample(self.late, x, modes, chances, random)
+        return np.where(came, early, late), modes, came
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Either:
+    """A message of a link that decides about more than its value: if it comes, `comes` follows, else `lost`."""
+
+    kind: int
+    comes: tuple[Step, ...]
+    lost: tuple[Step, ...]
+
+    def needs(self, live: Bits) -> Bits:
+        return needs(self.comes, live) | needs(self.lost, live)
+
+    def edges(self) -> Iterable[tuple[Indices, Indices]]:
+        for part in (self.comes, self.lost):
+            for step in part:
+                yield from step.edges()
+
+    def cut(self, live: Bits) -> tuple[list[Step], Bits]:
+        before = self.needs(live)
+        return [Either(self.kind, forced(self.comes, before, live), forced(self.lost, before, live))], before
+
+    def moment(self, X: Array, chances: Chances) -> Array:
+        p = chances.losses[self.kind]
+        comes = 0.0 if p == 1 else (1 - p) * moment(self.comes, X, chances)
+        return np.asarray(comes if p == 0 else comes + p * moment(self.lost, X, chances))
+
+    def mean(self, x: Array, chances: Chances) -> Array:
+        p = chances.losses[self.kind]
+        return np.asarray((1 - p) * mean(self.comes, x, chances) + p * mean(self.lost, x, chances))
+
+    def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
+        comes = random.random(x.shape[1]) >= chances.losses[self.kind]
+        with_it, _, _ = sample(self.comes, x, modes, chances, random)
+        without, _, _ = sample(self.lost, x, modes, chances, random)
+        return np.where(comes, with_it, without), modes, comes
+
+
+def needs(steps: Sequence[Step], live: Bits) -> Bits:
+    """Returns the registers that matter before steps, if those in `live` matter after them."""
+    for step in reversed(steps):
+        live = step.needs(live)
+    return live
+
+
+def moment(steps: Sequence[Step], X: Array, chances: Chances) -> Array:
+    """Returns the second moments after steps, (modes, registers, registers)."""
+    for step in steps:
+        X = step.moment(X, chances)
+    return X
+
+
+def mean(steps: Sequence[Step], x: Array, chances: Chances) -> Array:
+    """Returns the means of states after steps, (modes, registers, runs)."""
+    for step in steps:
+        x = step.mean(x, chances)
+    return x
+
+
+def sample(
+    steps: Sequence[Step], x: Array, modes: Indices, chances: Chances, random: Generator
+) -> tuple[Array, Indices, Bits]:
+    """Returns states and modes of runs after steps, and in which runs all messages came."""
+    came = np.ones(x.shape[1], dtype=bool)
+    for step in steps:
+        x, modes, its = step.sample(x, modes, chances, random)
+        came &= its
+    return x, modes, came
+
+
+def cut(steps: Sequence[Step], live: Bits) -> tuple[tuple[Step, ...], Bits]:
+    """Returns steps for the registers alone that matter, if those in `live` matter at the end, and which matter before them.
+    Linear maps that follow each other are multiplied."""
+    found: list[Step] = []
+    for step in reversed(steps):
+        parts, live = step.cut(live)
+        found[:0] = parts
+    return _multiplied(found), live
+
+
+def forced(steps: Sequence[Step], before: Bits, after: Bits) -> tuple[Step, ...]:
+    """Returns steps that take the registers in `before`, and lead to those in `after`."""
+    found, live = cut(steps, after)
+    return _multiplied([_prune(before, live), *found])
+
+
+def _prune(before: Bits, after: Bits) -> Linear:
+    """Returns the step from the registers in `before` to those of them that are in `after`."""
+    return Linear(csr_array(eye_array(len(before), format="csr")[after][:, before]))
+
+
+def _multiplied(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Returns steps with linear maps that follow each other multiplied, and maps that change nothing left out."""
+    found: list[Step] = []
+    for step in steps:
+        if isinstance(step, Linear) and found and isinstance(found[-1], Linear):
+            found[-1] = Linear(csr_array(step.F @ found[-1].F))
+        else:
+            found.append(step)
+    return tuple(
+        Linear.of(step.F) if isinstance(step, Linear) else step
+        for step in found
+        if not (isinstance(step, Linear) and _is_unit(step.F))
+    )
+
+
+def _is_unit(F: csr_array) -> bool:
+    return F.shape[0] == F.shape[1] and csr_array(abs(F - eye_array(F.shape[0], format="csr"))).nnz == 0

@@ -1,0 +1,160 @@
+"""Losses in the mean square: against the numbers of an independent derivation, maps written by hand, and all patterns of loss
+in the engine with robots that are points."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from echelon.controller.prediction.linear_run import later
+from echelon.controller.prediction.mean_square import gilbert, mean_square
+from echelon.controller.prediction.random_run import RandomRun
+from echelon.controller.prediction.random_steps import Chances, moment
+from echelon.controller.prediction.second_moment import SecondMoment
+from echelon.messages import Channel
+from echelon.plan.delay_tables import LOST, DelayTrace
+from echelon.plan.plan import Array, Plan
+from support.points import at_rest, point_run
+from support.trees import plan_of, random_epsilon, scenario, with_random_gains
+
+T = 0.1
+REST = {"kind": "line", "velocity": (0.0, 0.0)}
+
+
+def pair(lead: float = 0.0, **tables: object) -> Plan:
+    """Returns two robots in one group: their distance with σ = 0.25, the centroid with σ = 1."""
+    law = {"epsilon": [0.25], "lead": lead}
+    further = {"duration": 1.0, "trajectory": REST, "timing": "time_driven"} | tables
+    periods = {"acceleration": T, "torque": T / 10}
+    return plan_of(scenario((None, None), np.random.default_rng(1), law=law, periods=periods, **further))
+
+
+@pytest.mark.parametrize(
+    ("plan", "channel", "critical"),
+    [
+        (pair(), Channel.STATE, 0.530),
+        (pair(lead=0.5), Channel.STATE, 0.568),
+        (pair(), Channel.COMMAND, 0.531),
+        (later(pair(), Channel.STATE, round(T * 1e9)), Channel.STATE, 0.230),
+    ],
+)
+def test_critical_losses_of_an_independent_derivation(plan, channel, critical):
+    found = mean_square(plan, channel)
+    assert found.loss == pytest.approx(critical, abs=6e-4)
+    assert (found.ends, found.estimate) == ("unstable", False)
+    assert found.radius < 1
+
+
+def maps_by_hand(came: bool, K: Array, *, event_driven: bool) -> Array:
+    """Returns the map of one robot on (position, velocity, state in use, acceleration) if its state comes, or is lost."""
+    move, push, two, none = np.array([[1, T], [0, 1]]), np.array([[T**2 / 2], [T]]), np.eye(2), np.zeros((2, 2))
+    use = np.hstack([two, none, np.zeros((2, 1))]) if came else np.hstack([none, two, np.zeros((2, 1))])
+    a = K @ use
+    at_work = a if came or not event_driven else np.eye(5)[4:]
+    return np.vstack([np.hstack([move, np.zeros((2, 3))]) + push @ at_work, use, a])
+
+
+def by_hand(p: float, K: Array, *, event_driven: bool) -> float:
+    """Returns the growth of the second moment of one robot whose states are lost with the probability p."""
+    came, lost = (maps_by_hand(each, K, event_driven=event_driven) for each in (True, False))
+    return float(np.abs(np.linalg.eigvals((1 - p) * np.kron(came, came) + p * np.kron(lost, lost))).max())
+
+
+@pytest.mark.parametrize("event_driven", [False, True])
+@pytest.mark.parametrize("p", [0.0, 0.3, 0.6, 0.8])
+def test_growth_of_one_robot_is_that_of_its_map_by_hand(p, event_driven):
+    law = {"epsilon": [1.0], "gains": [{"k1": 4.0, "k2": 1.5}]}
+    timing = "event_driven" if event_driven else "time_driven"
+    periods = {"acceleration": T, "torque": T}
+    plan = plan_of(scenario((None,), np.random.default_rng(1), duration=T, law=law, periods=periods, timing=timing))
+    state = [at for at, link in enumerate(plan.links) if link.channel is Channel.STATE]
+    chances = Chances.of(np.where(np.arange(len(plan.links)) == state[0], p, 0.0))
+    radius = max(SecondMoment(part, chances).radius() for part in RandomRun(plan, state).parts())
+    assert radius == pytest.approx(by_hand(p, -np.array([[4.0, 1.5]]), event_driven=event_driven), rel=1e-6)
+
+
+def patterned(plan: Plan, came: Sequence[Sequence[bool]]) -> Plan:
+    """Returns the plan in which messages 0, 1, .. of each link come or not as `came` says."""
+    links = tuple(
+        replace(link, delays=DelayTrace(tuple(link.delay_min_ns if each else LOST for each in of_link)), punctual=False)
+        for link, of_link in zip(plan.links, came, strict=True)
+    )
+    return replace(plan, links=links)
+
+
+def random_plan(tree: Sequence[object], seed: int, **tables: object) -> Plan:
+    """Returns a plan with full gains and couplings."""
+    random = np.random.default_rng(seed)
+    periods = {"acceleration": T, "torque": T}
+    further = {"duration": T, "trajectory": REST} | tables
+    table = scenario(tree, random, law=random_epsilon(tree, random), periods=periods, **further)
+    return at_rest(with_random_gains(plan_of(table), random, coupling=0.2))
+
+
+@pytest.mark.parametrize("timing", ["time_driven", "event_driven"])
+@pytest.mark.parametrize(("tree", "broadcast", "ticks"), [
+    (((None,), None), False, 0),
+    (((None, None),), True, 1),
+    (((None,), (None,)), True, 0),
+    ((((None,),),), False, 0),
+])  # fmt: skip
+def test_second_moment_is_the_mean_over_all_patterns_of_loss(tree, timing, broadcast, ticks, monkeypatch):
+    """In one period all that arrives comes or not, in every combination; in the next all is lost.  Before and after all
+    comes."""
+    plan = later(random_plan(tree, 3, timing=timing), Channel.STATE, ticks * round(T * 1e9))
+    plan = replace(plan, links=tuple(replace(link, loss_of_message=broadcast) for link in plan.links))
+    losses = np.random.default_rng(5).uniform(0.2, 0.7, len(plan.links))
+    draws: dict[object, int] = {}
+    draw = [
+        draws.setdefault((link.source, link.channel) if broadcast else at, at) for at, link in enumerate(plan.links)
+    ]
+    losses = losses[draw]
+    hyperperiods = 4 + ticks
+
+    expected = np.zeros((4 * len(plan.robots),) * 2)
+    for came in product((False, True), repeat=len(draws)):
+        fate = dict(zip(draws.values(), came, strict=True))
+        share = np.prod([1 - losses[at] if fate[at] else losses[at] for at in draws.values()])
+        first = [1 if link.channel is Channel.STATE else 1 + ticks for link in plan.links]
+        rows = [(*(True,) * begin, fate[at], False, *(True,) * 10) for begin, at in zip(first, draw, strict=True)]
+        x = point_run(patterned(plan, rows), hyperperiods, monkeypatch)[hyperperiods]
+        expected += share * np.outer(x, x)
+
+    run = RandomRun(plan, range(len(plan.links)))
+    registers = run.registers
+    x = np.zeros(registers.count)
+    for number, robot in enumerate(plan.robots):
+        x[registers.memory(number)[:2]] = robot.start
+    # With late states, nothing is known in the first ticks, and nothing is commanded.
+    X = np.outer(x, x)[None]
+    for tick in range(hyperperiods):
+        now = tick - ticks
+        chances = Chances.of(losses if now == 1 else np.full(len(losses), float(now == 2)))
+        X = moment(run.steps, X, chances)
+    places = np.concatenate([registers.memory(number) for number in range(len(plan.robots))])
+    assert X[0][np.ix_(places, places)] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("burst", [1.5, 4.0])
+@pytest.mark.parametrize("loss", [0.1, 0.35])
+def test_growth_with_bursts_is_that_of_the_chains_kronecker_map(burst, loss):
+    """One robot whose states are lost in bursts, its map written by hand for each mode of the chain."""
+    law = {"epsilon": [1.0], "gains": [{"k1": 4.0, "k2": 1.5}]}
+    periods = {"acceleration": T, "torque": T}
+    plan = plan_of(scenario((None,), np.random.default_rng(1), duration=T, law=law, periods=periods))
+    state = [at for at, link in enumerate(plan.links) if link.channel is Channel.STATE]
+    chances = Chances.of(np.zeros(len(plan.links)), gilbert(loss, burst))
+    parts = RandomRun(plan, (), state).parts()
+    came, lost = (maps_by_hand(each, -np.array([[4.0, 1.5]]), event_driven=True) for each in (True, False))
+    g, b = loss / (1 - loss) / burst, 1 / burst
+    kron = np.block([
+        [(1 - g) * np.kron(came, came), b * np.kron(lost, lost)],
+        [g * np.kron(came, came), (1 - b) * np.kron(lost, lost)],
+    ])  # fmt: skip
+    expected = float(np.abs(np.linalg.eigvals(kron)).max())
+    for part in parts:
+        found = SecondMoment(part, chances)
+        assert (found.gain() < 1) == (expected < 1)
+        assert found.gain(1.001 * expected) < 1 < found.gain(0.999 * expected)

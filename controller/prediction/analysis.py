@@ -1,5 +1,4 @@
-"""The predictions of `echelon analyse` about a plan (docs/architecture.md, 2.7): whether it is stable, and how much later its
-messages may be."""
+"""Whether a plan is stable with the periods and delays that it has (docs/architecture.md, 2.7)."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -7,24 +6,12 @@ from dataclasses import dataclass
 from math import inf, log
 
 from echelon.controller.late_states import EXTRAPOLATE, PREDICT
-from echelon.controller.prediction.block_margin import delay_margin
 from echelon.controller.prediction.gains import PredictionError, linear_gains
-from echelon.controller.prediction.largest_delay import LargestDelay, largest_extra_delay
+from echelon.controller.prediction.likeness import reduced
 from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_links, untreated
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.messages import Channel
 from echelon.plan.plan import LinkPlan, Plan
-
-
-@dataclass(frozen=True, slots=True)
-class BlockMargin:
-    """The delay margin of a block alone, in continuous time, with its law without `lead`."""
-
-    name: str
-    sigma: float
-    """Time scale σ [s]"""
-    margin: float | None
-    """The largest delay for which it is stable [s]; None if it is unstable even without delay"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +24,10 @@ class Analysis:
     """The acceleration periods of the nodes [s], each once, in ascending order"""
     torque_periods: tuple[float, ...]
     """The torque periods of the robots [s], each once, in ascending order"""
-    blocks: tuple[BlockMargin, ...]
     hyperperiod: float
     """Period of the root [s]; all other periods divide it"""
     radius: float
     """Spectral radius of the run's map over one hyperperiod: in the long run errors are multiplied by it in each hyperperiod"""
-    later: dict[Channel, LargestDelay]
-    """For each channel how much later all of its messages may be than in the scenario; empty if the scenario itself is
-    unstable"""
     centroid_age: float
     """Mean age over the robots of their positions when the coordinator uses them [s].  A formation that moves with a constant
     velocity has a steady error of velocity times this age, which is not an instability"""
@@ -65,14 +48,11 @@ def analyse(plan: Plan) -> Analysis:
 
     Raises PredictionError if no exact prediction is possible: the law is not linear, links lose messages or have varying
     delays, messages are older than their timeout when they would be used, or delays are so long that the map is too large."""
-    blocks = tuple(
-        BlockMargin(block.name, block.sigma, delay_margin(linear_gains(plan, block, 0.0)))
-        for block in plan.blocks
-        if block.size
-    )
+    for block in plan.blocks:
+        linear_gains(plan, block)
     if found := untreated(plan):
         raise PredictionError(f"{describe_untreated(found)}: only constant delays without loss are treated")
-    run = LinearRun(plan)
+    run = LinearRun(reduced(plan)[0])
     radius = spectral_radius(run.map())
     links = {channel: ruled_links(plan, channel) for channel in CHANNELS}
     there = [channel for channel in CHANNELS if links[channel]]
@@ -80,10 +60,8 @@ def analyse(plan: Plan) -> Analysis:
         {channel: _each_once(link.delay_min_ns for link in links[channel]) for channel in there},
         _each_once(node.period_ns for node in plan.nodes),
         _each_once(robot.torque_period_ns for robot in plan.robots),
-        blocks,
         run.hyperperiod_ns * 1e-9,
         radius,
-        {channel: largest_extra_delay(plan, channel) for channel in there} if radius < 1 else {},
         _centroid_age(plan) if plan.reference == "now" else 0.0,
     )
 

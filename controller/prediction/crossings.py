@@ -81,12 +81,9 @@ def _brackets(eigenvalues: Eigenvalues, omegas: Array, logs: Array) -> Iterator[
     for row, column in zip(*np.nonzero(above[:-1] != above[1:]), strict=True):
         yield omegas[row], omegas[row + 1], column, above[row, column]
     before, at, after = logs[:-2], logs[1:-1], logs[2:]
-    turns = (
-        ((at - before) * (after - at) < 0)
-        & (np.abs(at) < NEAR)
-        & (above[:-2] == above[1:-1])
-        & (above[2:] == above[1:-1])
-    )
+    with np.errstate(invalid="ignore"):  # the logarithm of zero is -∞
+        turned = (at - before) * (after - at) < 0
+    turns = turned & (np.abs(at) < NEAR) & (above[:-2] == above[1:-1]) & (above[2:] == above[1:-1])
     for row, column in zip(*np.nonzero(turns), strict=True):
         left, right, sign = omegas[row], omegas[row + 2], 1 if above[row, column] else -1
         lowest = minimize_scalar(

@@ -1,219 +1,302 @@
-"""How much later all messages of a channel may be before the run near its formation is unstable (docs/architecture.md, 2.7).
+"""How much later the messages of some links may be before the run near its formation is unstable (docs/architecture.md, 2.7).
 
-All links of the channel get the same delay more, beyond what they have.  Where nodes and robots are time-driven it acts in
-ticks: a message is used at instants of its receiver, and said at instants of its source.  Where they are event-driven, whole
-ticks more shift what is used by as many messages; between the last stable tick and the next, bisection with the map finds the
-boundary: by an iteration with the cut run, or else by bisection with the map.
+All of these links get the same delay more, beyond what they have.  Where nodes and robots are time-driven it acts in ticks: a
+message is used at instants of its receiver, and said at instants of its source.  Where they are event-driven, delays between
+ticks count, and a message that comes just after an instant may be worse than one that comes at the next: a delay of 9.9 ms may
+be unstable where 10 ms are stable.  So the first tick is searched for at whose end, just before the next, the run is unstable;
+the boundary lies in this tick.
 
-*If all periods are equal*, the linear run is cut open where the messages of the channel are sent (`LinearRun.loop`).  From the
-messages that receivers get, to the messages that are sent, its transfer matrix is
+A *tick* is what divides the periods of all links and stages concerned, and the hyperperiod is m ticks.  A delay of k ticks more
+is q hyperperiods and r ticks, k = q m + r with 0 ≤ r < m.  For each r the linear run with r ticks more is cut open where the
+messages of these links are sent (`LinearRun.loop`).  From the messages that receivers get, to the messages that are sent, its
+transfer matrix over a hyperperiod is
 
     R(z) = C (z - A)⁻¹ B + D
 
-so with k extra ticks the roots are those of det(I - z^{-k} R(z)) = 0.  `controller.prediction.crossings` gives the k for which
-the first root reaches the unit circle, without trying one delay after the other, so that no delay is too large.  This takes k
-as continuous, which is valid if the eigenvalues of R(-1) are smaller than 1.  The result is confirmed by the maps for k and for
-k - 1 ticks, unless they are larger than `CONFIRMED`.
+so with q hyperperiods more the roots are those of det(I - z^{-q} R(z)) = 0.  `controller.prediction.crossings` gives the q for
+which the first root reaches the unit circle, without trying one delay after the other.  So no delay is too large, and periods
+may be of any length.  The smallest k of all r is the answer.  This takes q as continuous, which is valid if the eigenvalues of
+R(-1) are smaller than 1; small maps confirm it.
 
-*Otherwise* one delay after the other is tried, up to `TRIED` ticks.
+*Otherwise* delays are tried: one after the other up to `TRIED` ticks, then doubled and halved between.  The answer says so.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from math import ceil, gcd, inf, pi
+from math import gcd, inf, pi
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import block_array, csc_array, csr_array, eye_array
-from scipy.sparse.linalg import splu
 
-from echelon.controller.prediction.crossings import Crossing, Eigenvalues, crossings, smallest_delay, unstable_roots
-from echelon.controller.prediction.gains import PredictionError, linear_gains
-from echelon.controller.prediction.linear_run import LinearRun, Loop, later, ruled_links
-from echelon.controller.prediction.spectrum import spectral_radius, strong_parts
+from echelon.controller.prediction.crossings import smallest_delay, unstable_roots
+from echelon.controller.prediction.cut_loop import Cut
+from echelon.controller.prediction.gains import PredictionError
+from echelon.controller.prediction.likeness import reduced
+from echelon.controller.prediction.linear_run import Edges, LinearRun, edge_of, edges_of, later
+from echelon.controller.prediction.schedule import LONGEST
+from echelon.controller.prediction.spectrum import spectral_radius
+from echelon.controller.transformation import Transformation
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
-from echelon.plan.plan import Array, Plan
+from echelon.plan.plan import Plan
 
 TRIED: Final = 50
-"""Ticks up to which delays are tried out"""
+"""Ticks up to which all delays are tried, where the criterion is not valid"""
 FINE: Final = 1e-3
 """How closely the boundary is found where stages are event-driven, as a share of the delay, or of a tick"""
 STEPS: Final = 6
 """Largest number of steps of the iteration that finds it"""
 CONFIRMED: Final = 800
 """Size of the largest map that is computed to confirm a result"""
-SLOW: Final = 1e-3
-"""Crossings are searched from this multiple of the slowest block's natural frequency upwards"""
-SMALL: Final = 150
-"""Number of unknowns up to which equations are solved with dense matrices"""
-RANK: Final = 1e-12
-"""Singular values below this share of the largest one count as zero"""
-_TOGETHER: Final = 32
-"""Number of frequencies that are computed at once"""
+WORTH: Final = 100
+"""Largest delay for which a result is confirmed by maps [hyperperiods]"""
+REMAINDERS: Final = 20
+"""Largest number of ticks in a hyperperiod for which each remainder r is computed; with more, the last hyperperiod is
+searched"""
+NEAR: Final = 2.0
+"""Between two ticks, crossings are searched only within this factor of the frequency at which the run first becomes unstable"""
+SHARED: Final = 0.2
+"""Blocks with less than this share of the largest motion of a block at the boundary do not count as what limits it"""
+
+Ends = Literal["unstable", "timeout", "never", "limit"]
 
 
 @dataclass(frozen=True, slots=True)
 class LargestDelay:
-    """How much later the messages of a channel may be."""
+    """How much later the messages of some links may be."""
 
     tick_s: float
     """Length of a tick [s]"""
     ticks: int | None
-    """Every extra delay of 0 to `ticks` ticks is stable; None: even without extra delay the run is unstable"""
-    ends: Literal["unstable", "timeout", "limit"]
-    """Why it is not more: one tick more is unstable, or older than a link's timeout allows, or has not been tried out"""
+    """Every extra delay of 0 to `ticks` ticks is stable; None: even without extra delay the run is unstable, or every delay is
+    stable"""
+    ends: Ends
+    """Why it is not more.  `unstable`: one tick more is unstable; `timeout`: it is older than a link's timeout allows; `never`:
+    no delay is unstable; `limit`: longer delays have not been tried out"""
     beyond_s: float = 0.0
-    """How much more than `ticks` ticks is stable or young enough [s], where stages are event-driven"""
+    """Where stages are event-driven: every delay up to `ticks` ticks and this is stable and young enough [s]; negative if a
+    delay between two of these ticks is not"""
+    tried: bool = False
+    """True: found by trying delays, which may miss an unstable delay below a stable one"""
+    limits: tuple[str, ...] = ()
+    """The blocks that move in the motion that is at the edge of stability there"""
 
     @property
     def seconds(self) -> float | None:
-        """The largest additional delay [s]; None if not even 0 is stable."""
-        return None if self.ticks is None else self.ticks * self.tick_s + self.beyond_s
+        """The largest additional delay [s], infinite if no delay is unstable; None if not even 0 is stable."""
+        if self.ticks is None:
+            return inf if self.ends == "never" else None
+        return self.ticks * self.tick_s + self.beyond_s
 
 
-def largest_extra_delay(plan: Plan, channel: Channel) -> LargestDelay:
-    """Returns how much later all messages of a channel may be, in a plan whose links have constant delays and lose no messages.
+def largest_extra_delay(plan: Plan, late: Channel | Edges) -> LargestDelay:
+    """Returns how much later the messages of some links, or of all links of a channel, may be, in a plan whose links have
+    constant delays and lose no messages.
 
     Raises PredictionError if nothing exact can be said of the plan as it is, ValueError if it has no such link."""
-    found = _in_ticks(plan, channel)
+    edges = edges_of(plan, late)
+    if not edges:
+        what = "these links" if isinstance(late, frozenset) else f"channel {late.name.lower()}"
+        raise ValueError(f"{what}: there is no link of it")
+    search = _Search(*reduced(plan, edges))
+    found = search.in_ticks()
     if found.ticks is None or found.ends == "limit" or not any(one.event_driven for one in plan.formation):
         return found
-    tick_ns = round(found.tick_s * 1e9)
-    beyond_ns = _beyond(plan, channel, found.ticks, tick_ns) if found.ends == "unstable" else None
-    if beyond_ns is None:
-        low_ns, high_ns = found.ticks * tick_ns, (found.ticks + 1) * tick_ns
-        while high_ns - low_ns > max(1, FINE * high_ns):
+    return replace(found, beyond_s=search.beyond(found) * 1e-9)
+
+
+class _Search:
+    """The search for the largest delay of some links of a plan."""
+
+    def __init__(self, plan: Plan, late: Edges, names: tuple[tuple[str, ...], ...]) -> None:
+        self._plan, self._late, self._names = plan, late, names
+        self._patient = replace(plan, links=tuple(replace(link, timeout_ns=NEVER_NS) for link in plan.links))
+        self._run = run = LinearRun(plan)
+        self._links = [link for link in plan.links if edge_of(link) in late]
+        self._tick_ns = gcd(*(link.period_ns for link in self._links), *run.periods(late))
+        self._remainders = run.hyperperiod_ns // self._tick_ns
+        self._cuts: dict[int, Cut] = {}
+        self._window: tuple[float, float] | None = None
+
+    def in_ticks(self) -> LargestDelay:
+        """Returns the largest additional delay in whole ticks."""
+        tick_s = self._tick_ns * 1e-9
+        if spectral_radius(self._run.map()) >= 1:
+            return LargestDelay(tick_s, None, "unstable")
+        unstable, tried = self._first_unstable(), False
+        if unstable is None:
+            unstable, tried = self._first_tried(), True
+        too_old = self._first_too_old(unstable)
+        if too_old is not None and (unstable is None or unstable == -1 or too_old < unstable):
+            return LargestDelay(tick_s, too_old - 1, "timeout", tried=tried)
+        if unstable is None:  # only where delays are tried
+            return LargestDelay(tick_s, self._longest(), "limit", tried=True)
+        if unstable == -1:
+            return LargestDelay(tick_s, None, "never")
+        return LargestDelay(tick_s, unstable - 1, "unstable", tried=tried, limits=self._limits(unstable))
+
+    def beyond(self, found: LargestDelay) -> int:
+        """Returns how much more or less than whole ticks is stable and young enough [ns]."""
+        assert found.ticks is not None
+        whole_ns = found.ticks * self._tick_ns
+        if found.ends == "timeout":
+            low_ns, high_ns = whole_ns, whole_ns + self._tick_ns
+            while high_ns - low_ns > max(1, FINE * high_ns):
+                middle_ns = (low_ns + high_ns) // 2
+                low_ns, high_ns = (low_ns, middle_ns) if self._is_too_old(middle_ns) else (middle_ns, high_ns)
+            most_ns = low_ns
+        else:
+            most_ns = (found.ticks + 1) * self._tick_ns - 1
+        first = None if found.tried else self._first_unstable(self._tick_ns - 1)
+        if first is None:
+            first = found.ticks
+        low_ns, high_ns = first * self._tick_ns, (first + 1) * self._tick_ns - 1
+        if high_ns > most_ns or self._bears(high_ns):
+            return most_ns - whole_ns
+        if (at_edge := self._cut(self._tick_ns - 1 + first % self._remainders * self._tick_ns).frequency) is not None:
+            self._window, self._cuts = (at_edge / NEAR, min(NEAR * at_edge, pi)), {}
+        if (near_ns := self._by_iteration(first)) is not None:
+            return near_ns - whole_ns
+        while high_ns - low_ns > max(1, FINE * self._tick_ns):
             middle_ns = (low_ns + high_ns) // 2
-            low_ns, high_ns = (middle_ns, high_ns) if _bears(plan, channel, middle_ns) else (low_ns, middle_ns)
-        beyond_ns = low_ns - found.ticks * tick_ns
-    return replace(found, beyond_s=beyond_ns * 1e-9)
+            low_ns, high_ns = (middle_ns, high_ns) if self._bears(middle_ns) else (low_ns, middle_ns)
+        return low_ns - whole_ns
 
+    def _by_iteration(self, ticks: int) -> int | None:
+        """Returns the largest stable delay of `ticks` ticks and a part [ns] if all periods are equal; None if the iteration
+        fails.
 
-def _beyond(plan: Plan, channel: Channel, ticks: int, tick_ns: int) -> int | None:
-    """Returns how much more than `ticks` ticks is stable [ns] if all periods are equal; None if the criterion fails.
-
-    With f ticks more, 0 <= f < 1, the run bears k*(f) whole ticks, taken as continuous.  The boundary is where that is `ticks`.
-    k*(f) + f hardly depends on f, so f + k*(f) - ticks converges to it in a few steps."""
-    f = 0.0
-    for _ in range(STEPS):
-        run = LinearRun(later(plan, channel, round(f * tick_ns)))
-        found = None if run.periods() != {tick_ns} else _crossings(run, channel)
-        if not found or (edge := smallest_delay(found)) == inf:
+        With f ticks more, 0 <= f < 1, the run bears k*(f) whole ticks, taken as continuous.  The boundary is where that is
+        `ticks`.  k*(f) + f hardly depends on f, so f + k*(f) - ticks converges to it in a few steps."""
+        if self._remainders > 1:
             return None
-        step = edge - ticks
-        f += step
-        if not 0 <= f < 1:
+        f = 0.5
+        for _ in range(STEPS):
+            cut = self._cut(round(f * self._tick_ns))
+            if cut.found is None or (edge := smallest_delay(cut.found)) == inf:
+                return None
+            step = edge - ticks
+            f += step
+            if not 0 <= f < 1:
+                return None
+            if abs(step) < FINE:
+                at_ns = ticks * self._tick_ns + round(f * self._tick_ns)
+                off_ns = round(2 * FINE * self._tick_ns)
+                sure = self._bears(max(0, at_ns - off_ns)) and not self._bears(at_ns + off_ns)
+                return at_ns if sure else None
+        return None
+
+    def _bears(self, extra_ns: int) -> bool:
+        """Returns whether the run is stable with all these messages later."""
+        whole, part_ns = divmod(extra_ns, self._run.hyperperiod_ns)
+        cut = self._cut(part_ns)
+        if cut.found is not None and cut.is_stable:
+            return unstable_roots(cut.found, whole) <= 0
+        return spectral_radius(LinearRun(later(self._patient, self._late, extra_ns)).map()) < 1
+
+    def _cut(self, extra_ns: int) -> Cut:
+        """Returns the run with these messages later, cut open."""
+        if extra_ns not in self._cuts:
+            run = LinearRun(later(self._patient, self._late, extra_ns))
+            self._cuts[extra_ns] = Cut(run, self._late, self._window)
+        return self._cuts[extra_ns]
+
+    def _first_unstable(self, part_ns: int = 0) -> int | None:
+        """Returns the smallest number of ticks for which the run is unstable with these and `part_ns` more; -1 if there is
+        none.
+
+        Returns None if the criterion is not valid for the run, or is not confirmed by the maps."""
+        least = inf
+        m = self._remainders
+        for r in range(m if m <= REMAINDERS else 1):
+            if r >= least:
+                break
+            cut = self._cut(r * self._tick_ns + part_ns)
+            if not cut.is_stable:
+                least = r
+                break
+            if cut.found is None:
+                return None
+            if (q := cut.first_unstable()) is not None:
+                least = min(least, q * m + r)
+        if least == inf:
+            return -1
+        k = int(least)
+        if m > REMAINDERS:
+            low = max(-1, k - m)
+            while k - low > 1:
+                middle = (low + k) // 2
+                low, k = (middle, k) if self._bears(middle * self._tick_ns + part_ns) else (low, middle)
+        if not part_ns and k <= WORTH * m:
+            for ticks, is_stable in ((k - 1, True), (k, False)):
+                late = LinearRun(later(self._patient, self._late, ticks * self._tick_ns))
+                if late.size <= CONFIRMED and (spectral_radius(late.map()) < 1) != is_stable:
+                    return None
+        return k
+
+    def _first_tried(self) -> int | None:
+        """Returns the smallest number of extra ticks that was found to be unstable, by trying; None if none was."""
+
+        def bears(ticks: int) -> bool:
+            late = LinearRun(later(self._patient, self._late, ticks * self._tick_ns))
+            return spectral_radius(late.map()) < 1
+
+        for ticks in range(1, min(TRIED, self._longest()) + 1):
+            if not bears(ticks):
+                return ticks
+        low, high = TRIED, 2 * TRIED
+        try:
+            while bears(high):
+                low, high = high, 2 * high
+                if high > self._longest():
+                    return None
+            while high - low > 1:
+                middle = (low + high) // 2
+                low, high = (middle, high) if bears(middle) else (low, middle)
+        except PredictionError:  # too long to compute with
+            self._reached = low
             return None
-        if abs(step) < FINE:
-            return int(f * tick_ns)
-    return None
+        return high
 
+    def _longest(self) -> int:
+        """Returns the largest number of ticks that are tried."""
+        longest_ns = LONGEST * self._run.hyperperiod_ns - max(link.delay_max_ns for link in self._plan.links)
+        return min(getattr(self, "_reached", NEVER_NS), longest_ns // self._tick_ns)
 
-def _bears(plan: Plan, channel: Channel, extra_ns: int) -> bool:
-    """Returns whether the run is stable with all messages of a channel later, and none older than its timeout."""
-    try:
-        return spectral_radius(LinearRun(later(plan, channel, extra_ns)).map()) < 1
-    except PredictionError:
+    def _first_too_old(self, unstable: int | None) -> int | None:
+        """Returns the smallest number of extra ticks, below `unstable`, with which messages are too old; None if there is
+        none."""
+        if all(link.timeout_ns >= NEVER_NS for link in self._links):
+            return None
+        low, high = 0, 1
+        end = unstable if unstable is not None and unstable > 0 else self._longest()
+        while not self._is_too_old(high * self._tick_ns):
+            if high >= end:
+                return None
+            low, high = high, min(2 * high, end)
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self._is_too_old(middle * self._tick_ns) else (middle, high)
+        return high
+
+    def _is_too_old(self, extra_ns: int) -> bool:
+        """Returns whether messages are older than their timeouts when they would be used."""
+        try:
+            LinearRun(later(self._plan, self._late, extra_ns))
+        except PredictionError:
+            return True
         return False
 
-
-def _in_ticks(plan: Plan, channel: Channel) -> LargestDelay:
-    """Returns the largest additional delay in whole ticks; see `largest_extra_delay`."""
-    links = ruled_links(plan, channel)
-    if not links:
-        raise ValueError(f"channel {channel.name.lower()}: there is no link of it")
-    run = LinearRun(plan)
-    tick_ns = gcd(*(link.period_ns for link in links), *run.periods(channel))
-    if spectral_radius(run.map()) >= 1:
-        return LargestDelay(tick_ns * 1e-9, None, "unstable")
-    is_single_rate = run.periods() == {tick_ns}
-    if is_single_rate and (unstable := _first_unstable(run, channel)) is not None:
-        too_old = min(link.timeout_ns // tick_ns - -(-link.delay_min_ns // tick_ns) for link in links) + 1
-        ends: Literal["unstable", "timeout"] = "unstable" if unstable < too_old else "timeout"
-        return LargestDelay(tick_ns * 1e-9, min(unstable, too_old) - 1, ends)
-    for ticks in range(1, TRIED + 1):
-        try:
-            late = LinearRun(later(plan, channel, ticks * tick_ns))
-        except PredictionError:
-            return LargestDelay(tick_ns * 1e-9, ticks - 1, "timeout")
-        if spectral_radius(late.map()) >= 1:
-            return LargestDelay(tick_ns * 1e-9, ticks - 1, "unstable")
-    return LargestDelay(tick_ns * 1e-9, TRIED, "limit")
-
-
-def _first_unstable(run: LinearRun, channel: Channel) -> int | None:
-    """Returns the smallest number of extra ticks k for which a run is unstable that is stable for k = 0.
-
-    Returns None if the criterion is not valid for the run, finds no such k, or is not confirmed by the maps."""
-    plan, found = run.plan, _crossings(run, channel)
-    if found is None or (edge := smallest_delay(found)) == inf:
-        return None
-    k = max(1, ceil(edge))
-    while unstable_roots(found, k) <= 0:
-        k += 1
-    for ticks, is_stable in ((k - 1, True), (k, False)):
-        late = LinearRun(later(_patient(plan), channel, ticks * run.hyperperiod_ns))
-        if late.size <= CONFIRMED and (spectral_radius(late.map()) < 1) != is_stable:
-            return None
-    return k
-
-
-def _crossings(run: LinearRun, channel: Channel) -> list[Crossing] | None:
-    """Returns where eigenvalues of R(e^{jω}) cross the unit circle; None if the criterion is not valid for the run."""
-    plan = run.plan
-    stiffness = [linear_gains(plan, block).K_1 for block in plan.blocks if block.size]
-    slowest = min(float(np.sqrt(np.abs(np.linalg.eigvals(K_1)).min())) for K_1 in stiffness)
-    low = SLOW * slowest * run.hyperperiod_ns * 1e-9
-    found: list[Crossing] = []
-    for eigenvalues in _parts(run.loop(channel)):
-        if np.abs(eigenvalues(np.array([pi]))).max() >= 1:
-            return None
-        found += crossings(eigenvalues, low, pi)
-    return found
-
-
-def _patient(plan: Plan) -> Plan:
-    """Returns the plan with links without timeouts."""
-    return replace(plan, links=tuple(replace(link, timeout_ns=NEVER_NS) for link in plan.links))
-
-
-def _parts(loop: Loop) -> Iterator[Eigenvalues]:
-    """Yields the eigenvalues of R(e^{jω}) as functions of ω, for each part of the run whose variables act on each other.  Equal
-    parts are yielded once."""
-    size = loop.A.shape[0]
-    seen = set()
-    for rows in strong_parts(csr_array(block_array([[loop.A, loop.B], [loop.C, loop.D]]))):
-        x, u = rows[rows < size], rows[rows >= size] - size
-        part = Loop(loop.A[x][:, x], loop.B[x][:, u], loop.C[u][:, x], loop.D[u][:, u])
-        known = tuple(matrix.toarray().tobytes() for matrix in (part.A, part.B, part.C, part.D))
-        if part.B.nnz + part.D.nnz and known not in seen:
-            seen.add(known)
-            yield _eigenvalues(part)
-
-
-def _eigenvalues(part: Loop) -> Eigenvalues:
-    """Returns the eigenvalues of R(e^{jω}) as a function of ω.
-
-    The messages that receivers get act through few combinations, (B; D) = F V with a V of few rows.  So R has the eigenvalues
-    of the smaller matrix V (C (z - A)⁻¹, 1) F; the others are zero."""
-    size = part.A.shape[0]
-    left, strengths, V = np.linalg.svd(np.vstack([part.B.toarray(), part.D.toarray()]), full_matrices=False)
-    rank = int((strengths > RANK * strengths.max()).sum())
-    F, V = left[:, :rank] * strengths[:rank], V[:rank]
-    VC, VD = V @ part.C, V @ F[size:]
-    into_x = F[:size].astype(complex)
-    dense, sparse, unit = part.A.toarray() if size <= SMALL else None, csc_array(part.A), eye_array(size, format="csc")
-
-    def states(z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Returns (z - A)⁻¹ F for several z."""
-        if dense is not None:
-            return np.linalg.solve(z[:, None, None] * np.eye(size) - dense, into_x[None])
-        return np.array([splu(csc_array(each * unit - sparse)).solve(into_x) for each in z])
-
-    def eigenvalues(omega: Array) -> NDArray[np.complex128]:
-        some = np.array_split(omega, max(1, len(omega) // _TOGETHER))
-        return np.concatenate([np.linalg.eigvals(VC @ states(np.exp(1j * each)) + VD) for each in some])
-
-    return eigenvalues
+    def _limits(self, unstable: int) -> tuple[str, ...]:
+        """Returns the names of the blocks that move most in the motion at the edge of stability."""
+        q, r = divmod(unstable, self._remainders)
+        cut = self._cuts.get(r * self._tick_ns)
+        if cut is None or cut.found is None or (motions := cut.motions(q)) is None:
+            return ()
+        z = np.abs(Transformation(self._plan).forward(motions))
+        moves: dict[tuple[str, ...], float] = {}
+        for block, names in zip(self._plan.blocks, self._names, strict=True):
+            rows = slice(block.offset // 2, (block.offset + block.size) // 2)
+            if block.size:
+                moves[names] = max(moves.get(names, 0.0), float(np.linalg.norm(z[:, rows])))
+        most = max(moves.values())
+        return tuple(name for names in moves if moves[names] > SHARED * most for name in names)

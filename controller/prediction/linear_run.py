@@ -38,10 +38,15 @@ CHANNELS: Final = (Channel.STATE, Channel.GROUP_STATE, Channel.REFERENCE, Channe
 """The channels to which the rules in a scenario's `links` apply; links of other channels stand for shafts and buses"""
 
 
+Edge = tuple[int, int, Channel]
+"""A link: source, receiver, channel"""
+Edges = frozenset[Edge]
+
+
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """The linear run, cut open where the messages of one channel are sent.  y are the messages that are sent in a hyperperiod,
-    u are the messages that links take in their place:
+    """The linear run, cut open where the messages of some links are sent.  y are the messages that are sent in a hyperperiod,
+    u are the messages that these links take in their place:
 
         x⁺ = A x + B u,   y = C x + D u
     """
@@ -58,11 +63,22 @@ def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
     return tuple(link for link in plan.links if not link.steady or link.policy in (EXTRAPOLATE, PREDICT))
 
 
-def later(plan: Plan, channel: Channel, extra_ns: int) -> Plan:
-    """Returns the plan with `extra_ns` added to the delays of all links of a channel of `CHANNELS`."""
+def edges_of(plan: Plan, late: Channel | Edges) -> Edges:
+    """Returns the links of a channel of `CHANNELS`, or these links themselves."""
+    return late if isinstance(late, frozenset) else frozenset(map(edge_of, ruled_links(plan, late)))
+
+
+def edge_of(link: LinkPlan) -> Edge:
+    """Returns which link this is."""
+    return link.source, link.receiver, link.channel
+
+
+def later(plan: Plan, late: Channel | Edges, extra_ns: int) -> Plan:
+    """Returns the plan with `extra_ns` added to the delays of some links, or of all links of a channel of `CHANNELS`."""
+    edges = edges_of(plan, late)
 
     def longer(link: LinkPlan) -> LinkPlan:
-        if link.channel is not channel or not _is_ruled(plan, link):
+        if edge_of(link) not in edges:
             return link
         return replace(link, delay_min_ns=link.delay_min_ns + extra_ns, delay_max_ns=link.delay_max_ns + extra_ns)
 
@@ -101,57 +117,59 @@ class LinearRun:
         )
         self._tick_ns = gcd(*(stage.timed.period_ns for stage in self._stages))
         self._schedule = schedule(plan, [stage.timed for stage in self._stages])
-        self._wires = self._make_wires()
-        self._places: list[int] = []
-        """Where in x the memory of each role begins"""
-        self.size = 0
-        """Number of components of x"""
+        self._places = [0]
+        """Where in x the memory of each role begins, and where the last one ends"""
         for role in self._roles:
-            self._places.append(self.size)
-            self.size += len(role.powers)
-        for wire in self._wires.values():
-            wire.at = self.size
-            self.size += wire.on_way * wire.size
+            self._places.append(self._places[-1] + len(role.powers))
+        self._wires, self.size = self._lay_out(frozenset())
 
-    def periods(self, channel: Channel | None = None) -> set[int]:
-        """Returns the periods of all stages [ns], or of the stages that use messages of a channel."""
+    def periods(self, late: Edges | None = None) -> set[int]:
+        """Returns the periods of all stages [ns], or of the stages that use messages of some links."""
         return {
             stage.timed.period_ns
             for stage in self._stages
-            if channel is None or any(heard.channel is channel for heard in stage.timed.inputs)
+            if late is None
+            or any((heard.source, stage.timed.member, heard.channel) in late for heard in stage.timed.inputs)
         }
 
     def map(self) -> csr_array:
         """Returns M, (size, size)."""
-        return self._through(None).A
+        return self._through(frozenset()).A
 
-    def loop(self, channel: Channel) -> Loop:
-        """Returns the linear run, cut open where the messages of a channel are sent."""
-        return self._through(channel)
+    def loop(self, cut: Edges) -> Loop:
+        """Returns the linear run, cut open where the messages of some links are sent."""
+        return self._through(cut)
 
     def _units(self, powers: Sequence[int]) -> Array:
         """Returns H to these powers: the factors that turn numbers in SI units into components of x."""
         return (self.hyperperiod_ns * 1e-9) ** np.array(powers, dtype=float)
 
-    def _make_wires(self) -> "dict[tuple[int, Channel], _Wire]":
-        """Returns the wires of all that is heard, by source and channel."""
+    def _lay_out(self, cut: Edges) -> "tuple[dict[_Key, _Wire], int]":
+        """Returns the wires of all that is heard, and the number of components of x.  Where links are cut, their receivers have
+        a wire of their own."""
         plan = self.plan
         periods = {(link.source, link.channel): link.period_ns for link in plan.links}
-        wires: dict[tuple[int, Channel], _Wire] = {}
+        wires: dict[_Key, _Wire] = {}
         for stage, acts in zip(self._stages, self._schedule, strict=True):
             for act in (act for some in acts.values() for act in some):
                 for heard, number in zip(stage.timed.inputs, act.used, strict=True):
                     at = heard.source, heard.channel
-                    if at not in wires:
-                        wires[at] = _Wire(periods[at], self._units(powers_of(plan, *at)))
-                    wires[at].used.add(number)
-        return wires
+                    key = *at, (heard.source, stage.timed.member, heard.channel) in cut
+                    if key not in wires:
+                        wires[key] = _Wire(periods[at], self._units(powers_of(plan, *at)))
+                    wires[key].used.add(number)
+        size = self._places[-1]
+        for wire in wires.values():
+            wire.at = size
+            size += wire.on_way * wire.size
+        return wires, size
 
-    def _through(self, cut: Channel | None) -> Loop:
-        """Takes unit vectors through one hyperperiod; returns the linear run, cut open at channel `cut` if it is given."""
-        hyperperiod_ns, wires, columns = self.hyperperiod_ns, self._wires, Columns()
+    def _through(self, cut: Edges) -> Loop:
+        """Takes unit vectors through one hyperperiod; returns the linear run, cut open at the links `cut`."""
+        hyperperiod_ns, columns = self.hyperperiod_ns, Columns()
+        wires, size = self._lay_out(cut) if cut else (self._wires, self.size)
         units = [self._units(role.powers) for role in self._roles]
-        memories = [columns.of_x(at, unit) for at, unit in zip(self._places, units, strict=True)]
+        memories = [columns.of_x(at, unit) for at, unit in zip(self._places[:-1], units, strict=True)]
         old = {
             (wire, number): columns.of_x(wire.place(number), wire.unit)
             for wire in wires.values()
@@ -160,8 +178,8 @@ class LinearRun:
         }
         given = {
             (wire, number): columns.of_u(wire.unit)
-            for (_, channel), wire in wires.items()
-            if channel is cut
+            for (_, _, is_cut), wire in wires.items()
+            if is_cut
             for number in range(hyperperiod_ns // wire.period_ns)
         }
         for role, seed in zip(self._roles, memories, strict=True):
@@ -176,21 +194,27 @@ class LinearRun:
             for stage, acts in zip(self._stages, self._schedule, strict=True):
                 if time_ns not in acts:
                     continue
-                inputs = [wires[heard.source, heard.channel].said for heard in stage.timed.inputs]
+                member = stage.timed.member
+                inputs = [
+                    wires[heard.source, heard.channel, (heard.source, member, heard.channel) in cut].said
+                    for heard in stage.timed.inputs
+                ]
                 heard = [
                     (after_ns, [said[number] for said, number in zip(inputs, used, strict=True)])
                     for after_ns, used in acts[time_ns]
                 ]
                 values = stage.run(heard)
                 for channel, period_ns in stage.timed.says:
-                    if time_ns % period_ns == 0 and (stage.timed.member, channel) in wires:
-                        wire, number = wires[stage.timed.member, channel], time_ns // period_ns
-                        said[wire, number] = values[channel]
-                        if (wire, number) not in given:
-                            wire.said[number] = values[channel]
+                    if time_ns % period_ns:
+                        continue
+                    number = time_ns // period_ns
+                    if (cut_wire := wires.get((member, channel, True))) is not None:
+                        said[cut_wire, number] = values[channel]
+                    if (whole_wire := wires.get((member, channel, False))) is not None:
+                        whole_wire.said[number] = values[channel]
 
         rows = Rows(columns)
-        for role, at, unit in zip(self._roles, self._places, units, strict=True):
+        for role, at, unit in zip(self._roles, self._places[:-1], units, strict=True):
             rows.add(at, unit[:, None] * role.memory)
         for wire in wires.values():
             for number in range(-wire.on_way, 0):
@@ -199,13 +223,17 @@ class LinearRun:
                     rows.add(wire.place(number), wire.unit[:, None] * wire.said[now])
                 else:
                     rows.move(wire.place(number), wire.place(now), wire.size)
-        A, B = rows.matrices(self.size, self.size)
+        A, B = rows.matrices(size, size)
         out, at = Rows(columns), 0
         for wire, number in given:
             out.add(at, wire.unit[:, None] * said[wire, number])
             at += wire.size
-        C, D = out.matrices(at, self.size)
+        C, D = out.matrices(at, size)
         return Loop(A, B, C, D)
+
+
+_Key = tuple[int, Channel, bool]
+"""Source and channel of a wire, and whether its links are cut"""
 
 
 class _Wire:

@@ -1,128 +1,113 @@
-"""The command `echelon analyse`: computes, without a run, whether a formation settles and how much delay it tolerates."""
+"""The command `echelon analyse`: computes, without a run, whether a formation settles, and what it tolerates."""
 
-import json
-from collections.abc import Sequence
+import shlex
+import sys
+import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
 
-from echelon.cli.options import Command
+from echelon.cli.options import Command, option
 from echelon.cli.shared import JSON, ScenarioOptions
 from echelon.errors import UsageError
 
 if TYPE_CHECKING:
-    from echelon.controller.prediction.analysis import Analysis
-    from echelon.controller.prediction.largest_delay import LargestDelay
+    from echelon.plan.plan import Plan
+    from echelon.scenario.tables import Law
+    from echelon.sim.results.analysis import AnalysisResult
+
+LONG_S: Final = 2.0
+"""Progress is shown for what takes longer than this"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnalyseOptions(ScenarioOptions):
     """Options of `echelon analyse`."""
 
+    members: bool = field(default=False, metadata=option("also what the links of each robot and each group tolerate"))
+    figures: Path | None = field(
+        default=None, metadata=option("write each figure as a file into this folder, beside the text", "DIR")
+    )
+    format: tuple[Literal["svg", "pdf", "png"], ...] = field(
+        default=(), metadata=option("format of the files of --figures; may be repeated (default: svg)")
+    )
     json: bool = field(default=False, metadata=JSON)
 
 
 def analyse(options: AnalyseOptions) -> int:
-    """Computes whether the formation settles and how much delay it tolerates.
+    """Computes whether the formation settles and what it tolerates.
 
     Returns exit code 1 if it does not settle, or if the torque loop of a robot diverges."""
+    from echelon.cli.analyse_text import lines_of
     from echelon.cli.scenario_file import read_scenario
-    from echelon.controller.prediction.analysis import analyse as analysis_of
     from echelon.controller.prediction.gains import PredictionError
-    from echelon.sim.forecast.motion import asked_of, torque_loop_diverges, torque_loop_warnings
+    from echelon.sim.forecast.analysing import analysis_of
+    from echelon.sim.forecast.motion import asked_of, torque_loop_warnings
+    from echelon.sim.results.rendering import json_text
 
-    _, plan = read_scenario(options.scenario, options.overrides)
+    if options.format and options.figures is None:
+        raise UsageError(f"--format {options.format[0]}: needs --figures DIR, which writes the figures as files")
+    scenario, plan = read_scenario(options.scenario, options.overrides)
+    law, progress = scenario.law, _Progress()
     try:
-        found = analysis_of(plan)
+        found = analysis_of(plan, law.time_scales, law.epsilon, members=options.members, say=progress.say)
     except PredictionError as error:
         raise UsageError(f"{options.scenario}: cannot be analysed; run it instead: {error}") from None
-    asked = asked_of(plan)
-    diverges, warnings = torque_loop_diverges(plan, asked), torque_loop_warnings(plan, asked)
+    finally:
+        progress.end()
+    written = [] if options.figures is None else _save_figures(options, found, plan, law, progress)
     if options.json:
-        print(json.dumps({"scenario": plan.name, **_facts(found), "torque_loop_diverges": diverges}, indent=2))
+        print(json_text(found))
     else:
-        print("\n".join(_lines(plan.name, found, warnings, closed=plan.can.closed, diverges=diverges)))
-    return 0 if found.settles and not diverges else 1
+        print("\n".join(lines_of(found, torque_loop_warnings(plan, asked_of(plan)))))
+        print(*written, sep="\n", end="\n" if written else "")
+    return 0 if found.settles and not found.torque_loop_diverges else 1
 
 
-def _facts(found: "Analysis") -> dict[str, Any]:
-    """Returns the results as data for JSON; all times are in seconds."""
-    return {
-        "periods": {"acceleration": found.acceleration_periods, "torque": found.torque_periods},
-        "delays": {channel.name.lower(): delays for channel, delays in found.delays.items()},
-        "blocks": {block.name: {"sigma": block.sigma, "delay_margin": block.margin} for block in found.blocks},
-        "settles": found.settles,
-        "hyperperiod": found.hyperperiod,
-        "spectral_radius": found.radius,
-        "centroid_age": found.centroid_age,
-        "later": {
-            channel.name.lower(): {"seconds": each.seconds, "ticks": each.ticks, "tick": each.tick_s, "ends": each.ends}
-            for channel, each in found.later.items()
-        },
-    }
+def _save_figures(
+    options: AnalyseOptions, found: "AnalysisResult", plan: "Plan", law: "Law", progress: "_Progress"
+) -> list[Path]:
+    """Writes the figures; returns their files.  Raises UsageError if that fails."""
+    from echelon.sim.forecast.analysing import scaled_delays
+    from echelon.sim.report.analysis_figures import analysis_figures
+
+    words = ["echelon", "analyse", options.scenario, *(word for each in options.overrides for word in ("--set", each))]
+    try:
+        scaled = scaled_delays(plan, law.time_scales, law.epsilon, progress.say) if found.settles else ()
+    finally:
+        progress.end()
+    assert options.figures is not None
+    pictures = analysis_figures(found, scaled, shlex.join(words))
+    written = []
+    try:
+        options.figures.mkdir(parents=True, exist_ok=True)
+        for name, picture in pictures.items():
+            for kind in options.format or ("svg",):
+                written.append(options.figures / f"{name}.{kind}")
+                picture.save(written[-1])
+    except OSError as error:
+        raise UsageError(f"{error.filename or options.figures}: {error.strerror}") from None
+    return written
 
 
-def _lines(name: str, found: "Analysis", warnings: Sequence[str], *, closed: bool, diverges: bool) -> list[str]:
-    """Returns the results as lines for people.
+class _Progress:
+    """A line about what is being computed, on a terminal, if it takes long."""
 
-    `warnings` are about the torque loop, which `diverges` or not; `closed` says that the torque path is closed."""
-    channels = _enumeration([channel.name.lower() for channel in found.delays])
-    accelerations, torques = (_ms(periods) for periods in (found.acceleration_periods, found.torque_periods))
-    lines = [f"{name}: channels {channels}; accelerations every {accelerations}, torques every {torques}"]
-    late = [
-        f"{channel.name.lower()} {_ms(delays)}"
-        for channel, delays in found.delays.items()
-        if any(d > 0 for d in delays)
-    ]
-    lines.append(f"  delays of the scenario's links: {', '.join(late) if late else 'none'}; no link loses messages")
-    lines.append(
-        "  assumed: robots follow the desired accelerations exactly, no limit acts, avoidance does not act"
-        + (", bus and drives take no time" if closed else "")
-    )
-    for block in found.blocks:
-        margin = "unstable without any delay" if block.margin is None else f"{1e3 * block.margin:.4g} ms"
-        lines.append(
-            f"  {block.name:<12} σ {block.sigma:<6.4g} s   margin of the block alone, in continuous time: {margin}"
-        )
-    step = f"spectral radius {found.radius:.6f} over {_ms([found.hyperperiod])}"
-    outcome = "settles; errors shrink" if found.settles else "does not settle; errors grow"
-    lines.append(f"  all together, with these delays: {outcome} e-fold in {found.time_constant:.3g} s ({step})")
-    lines += [f"  but {each}" for each in warnings]
-    if diverges or not found.settles:
-        return lines
-    if found.centroid_age > 0:
-        lines.append(
-            f"  positions are {1e3 * found.centroid_age:.4g} ms old at the coordinator: the centroid of a moving formation is "
-            "off its trajectory by the distance that it moves in this time"
-        )
-    beyond = "beyond these delays, " if late else ""
-    lines.append(f"  {beyond}all messages of one channel may be later by up to")
-    lines += [f"    {channel.name.lower():<12} {_later(each)}" for channel, each in found.later.items()]
-    return lines
+    def __init__(self) -> None:
+        self._since = time.monotonic()
+        self._shown = False
 
+    def say(self, what: str, done: int, of: int) -> None:
+        """Shows what is being computed."""
+        if sys.stderr.isatty() and time.monotonic() - self._since > LONG_S:
+            self._shown = True
+            print(f"\r\x1b[K{what}: {done} of {of}", end="", file=sys.stderr, flush=True)
 
-def _later(found: "LargestDelay") -> str:
-    """Returns in words how much later messages may be, and what happens beyond that.  Only for a formation that settles."""
-    assert found.ticks is not None
-    assert found.seconds is not None
-    if found.beyond_s > 0 and found.ends == "unstable":
-        return f"{1e3 * found.seconds:.6g} ms ({found.seconds / found.tick_s:.4g} ticks of {1e3 * found.tick_s:g} ms)"
-    why = {
-        "unstable": "one tick more does not settle",
-        "timeout": "with one tick more they are older than the timeout allows, and not used at all",
-        "limit": "longer delays have not been tried",
-    }
-    return f"{1e3 * found.seconds:.6g} ms ({found.ticks} ticks of {1e3 * found.tick_s:g} ms); {why[found.ends]}"
-
-
-def _ms(seconds: Sequence[float]) -> str:
-    """Returns times [s] as text in milliseconds: one number if all are equal, else the smallest and the largest."""
-    least, most = (f"{1e3 * each:g}" for each in (min(seconds), max(seconds)))
-    return f"{least} ms" if least == most else f"{least} to {most} ms"
-
-
-def _enumeration(names: Sequence[str]) -> str:
-    """Returns names as a list in words: `a, b and c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    def end(self) -> None:
+        """Removes the line."""
+        if self._shown:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            self._shown = False
 
 
 ANALYSE: Final = Command(
@@ -131,14 +116,17 @@ ANALYSE: Final = Command(
     work=analyse,
     about="""\
 Computes, without a run, whether the formation settles with the periods of the scenario and the
-constant delays of its links, and how much later all messages of one channel may come before it
-no longer settles.  It assumes that robots follow the desired accelerations exactly, and reports
-a torque loop that is too slow for that.  It refuses links that lose messages or whose delays
-vary, and laws that are not linear: run such scenarios instead.""",
+constant delays of its links, how each block's error decays, and what links tolerate: a table of
+layers and channels with the largest delay and what limits it.  Further how large ε and couplings
+may be, exactly and by Lyapunov bounds, and whether the torque loops inside the robots are stable.
+It assumes that robots follow the desired accelerations exactly.  It refuses links that lose
+messages or whose delays vary, and laws that are not linear: run such scenarios instead.""",
     examples={
         "echelon analyse paper": "states may be up to 6.8 ms late",
         "echelon analyse lab --set 'links=[{channel=\"state\",delay=0.3}]'": "with a delay",
-        "echelon analyse lab --json": "for scripts",
+        "echelon analyse lab --members": "also what the links of each robot and each group tolerate",
+        "echelon analyse lab --figures figures --format pdf": "also figures, as PDF",
+        "echelon analyse lab --json": "for scripts (`echelon schema analysis` describes it)",
     },
     codes={0: "it settles", 1: "it does not settle, or a torque loop diverges"},
 )

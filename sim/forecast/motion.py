@@ -6,12 +6,7 @@ The motion is computed for points that follow the desired accelerations exactly,
 
 *Wheel speed*: a robot that moves straight ahead at |v| turns its wheels at |v|/r; in a turn one wheel is faster.
 
-*Torque loop*: without a desired acceleration, a robot that moves at v turns into its direction of travel: ω̇ = -(v/d) ω.  The
-torque loop computes the torque for the middle of its period h and holds it for the period, so with q = h v/d
-
-    ω⁺ = (1 - q + q²/2) ω
-
-which decays if and only if q < 2.
+*Torque loop*: see `torque_loop`; q = h v/d says how near the torque period h is to its edge.
 """
 
 from dataclasses import dataclass
@@ -25,13 +20,12 @@ from echelon.controller.laws.central import CentralLaw
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.errors import PartRunError
 from echelon.plan.plan import Array, Plan, RobotPlan
+from echelon.sim.forecast.torque_loop import torque_loops
 
 STEPS: Final = 1000
 """Number of periods for which the motion is computed"""
 INSTANTS: Final = 200
 """Number of instants, spread over the run, at which the speed of the trajectory is computed"""
-EDGE: Final = 2.0
-"""The torque loop diverges from this value of q on"""
 NEAR: Final = 1.0
 """The torque loop settles slowly from this value of q on"""
 
@@ -96,21 +90,23 @@ def motion_warnings(plan: Plan) -> list[str]:
 def torque_loop_warnings(plan: Plan, asked: Asked) -> list[str]:
     """Returns a line if the torque loop of a robot diverges, or hardly settles, at the largest speed that is asked of it."""
     q = torque_loop_numbers(plan, asked)
-    slow = [at for at, each in enumerate(q) if each >= NEAR]
+    loops = torque_loops(plan, asked.speeds.tolist())
+    slow = [at for at, each in enumerate(q) if each >= NEAR or not loops[at].is_stable]
     if not slow:
         return []
     worst = max(slow, key=lambda at: q[at])
     robot, speed = plan.robots[worst], asked.speeds[worst]
-    does = "diverges" if q[worst] >= EDGE else "hardly settles"
+    loop = loops[worst]
+    does = "hardly settles" if loop.is_stable else "diverges"
     return [
         f"periods.torque = {robot.torque_period_ns / 1e9:g}: the torque loop of {_named(plan, worst, len(slow))} {does} at the "
-        f"{speed:.3g} m/s that are asked of it; it must be well below 2 offset/speed = {2 * abs(robot.offset) / speed:.3g} s"
+        f"{speed:.3g} m/s that are asked of it; it must be well below {loop.longest_period:.3g} s"
     ]
 
 
 def torque_loop_diverges(plan: Plan, asked: Asked) -> bool:
     """Returns whether the torque loop of any robot diverges at the largest speed that is asked of it."""
-    return max(torque_loop_numbers(plan, asked)) >= EDGE
+    return not all(loop.is_stable for loop in torque_loops(plan, asked.speeds.tolist()))
 
 
 def torque_loop_numbers(plan: Plan, asked: Asked) -> list[float]:

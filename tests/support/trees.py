@@ -125,3 +125,48 @@ def near_unit(size: int, random: Generator) -> list[list[float]]:
     """Returns a random full matrix close to the unit matrix."""
     rows: list[list[float]] = (np.eye(size) + 0.2 * random.normal(size=(size, size))).tolist()
     return rows
+
+
+def like_groups(groups: int, robots: int, **tables: Any) -> Plan:
+    """Returns the plan of any number of like groups of like robots, also more than a bus has identifiers for: that of two
+    groups of two robots, multiplied.  Robots have no drives of their own; the plan is for predictions."""
+    law = {"epsilon": [0.5, 0.5], "lead": 0.5}
+    base = plan_of(scenario(((None, None), (None, None)), np.random.default_rng(1), **({"law": law} | tables)))
+    count, shape = groups * robots, base.nodes[0].shape
+    root, members = count + groups, []
+    for group in range(groups):
+        for robot in range(robots):
+            number = group * robots + robot
+            place = {"index": number, "parent": count + group, "child_number": robot, "path": f"g{group}/r{number}"}
+            members.append(replace(base.robots[0], **place))
+    nodes, blocks = [], []
+    for group in range(groups + 1):
+        below = range(count, root) if group == groups else range(group * robots, (group + 1) * robots)
+        old = base.root if group == groups else base.nodes[0]
+        weights = (robots if group == groups else 1,) * len(below)
+        points = tuple((float(at), 0.0) for at in range(len(below)))
+        index = {"index": count + group, "children": tuple(below), "weights": weights}
+        place = {} if group == groups else {"parent": root, "child_number": group, "path": f"g{group}"}
+        place["first_robot"] = 0 if group == groups else group * robots
+        nodes.append(replace(old, shape=replace(shape, kind="points", points=points), **index, **place))
+        block = base.block_of(old.index)
+        size, offset = 2 * (len(below) - 1), 2 * group * (robots - 1)
+        name = block.name if group == groups else f"g{group}"
+        k1, k2 = (gain[0, 0] * np.eye(size) for gain in (block.k1, block.k2))
+        blocks.append(replace(block, name=name, node=count + group, offset=offset, size=size, k1=k1, k2=k2))
+    blocks.append(replace(base.blocks[-1], offset=2 * (count - 1)))
+    one = {(link.source < 4, link.receiver < 4, link.channel): link for link in base.links}
+    links = []
+    for parent in nodes:
+        for child in parent.children:
+            for (from_robot, to_robot, _), link in one.items():
+                if child < count and (from_robot or to_robot):
+                    ends = (child, parent.index) if from_robot else (parent.index, child)
+                elif child >= count and not from_robot and not to_robot:
+                    ends = (child, parent.index) if link.source < link.receiver else (parent.index, child)
+                else:
+                    continue
+                links.append(replace(link, source=ends[0], receiver=ends[1]))
+    tree = {"robots": tuple(members), "nodes": tuple(nodes), "blocks": tuple(blocks), "links": tuple(links)}
+    avoidance = replace(base.avoidance, enabled=False)
+    return with_message_sizes(replace(base, coupling=np.zeros((2 * count, 2 * count)), avoidance=avoidance, **tree))

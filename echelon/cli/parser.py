@@ -98,6 +98,7 @@ ENTRIES: Final = {
     "analyse": Entry("compute how much delay a scenario's control law bears", _scenario),
     "sweep": Entry("run a scenario many times, with values that vary, and search for what it bears", _sweep),
     "figures": Entry("draw the figures of a sweep, with predictions beside what was measured", _studies),
+    "study": Entry("make a study: sweeps, figures, and a finding whose numbers are checked", _studies),
     "dbc": Entry("print the DBC of a scenario's drives, for cantools, SavvyCAN and the like", _scenario),
     "schema": Entry("print the schema of scenario files, for editors, or of summaries", _scenario),
     "report": Entry("write the report of a run, or a comparison of several", _results),

@@ -11,6 +11,7 @@ from echelon.controller.laws.law import LinearGains
 from echelon.controller.prediction.gains import PredictionError, linear_gains, poles
 from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_links, untreated
+from echelon.controller.prediction.mean_square import Losses
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.plan.plan import BlockPlan, LinkPlan, Plan
 
@@ -22,38 +23,42 @@ PlanOf = Callable[[float], Plan]
 
 
 def stable(plan: Plan) -> bool | None:
-    """Returns whether errors decay in the linear run of a plan; None if nothing exact can be said."""
+    """Returns whether errors vanish in the linear run of a plan, in the mean square where links lose messages; None if nothing
+    exact can be said."""
     try:
-        if untreated(plan):
-            return None
-        return bool(spectral_radius(LinearRun(plan).map()) < 1)
+        if not untreated(plan):
+            return bool(spectral_radius(LinearRun(plan).map()) < 1)
+        lossy = [link for link in plan.links if link.loss]
+        if lossy and all(link.delay_min_ns % plan.formation[link.receiver].period_ns == 0 for link in lossy):
+            return Losses(plan, (), None).gain(0.0) < 1
     except PredictionError:
-        return None
+        pass
+    return None
 
 
 def boundary(plan_of: PlanOf, values: Sequence[float]) -> tuple[float | None, bool]:
     """Returns the largest value that is stable, and whether anything can be said.  `values` are those that were tried, in
     ascending order; `plan_of` makes the plan of a value.
 
-    None means that even the lowest value is unstable, and infinity that all are stable, however large.  Delays of all links of a
-    channel have a boundary of their own (`largest_extra_delay`), also beyond the values that were tried.  Otherwise it is
+    None means that even the lowest value is unstable, and infinity that all are stable, however large.  Delays of all links of
+    a channel have a boundary of their own (`largest_extra_delay`), also beyond the values that were tried.  Otherwise it is
     searched for by bisection between the values, which takes what is stable to be one range from the lowest value on."""
     low, high = values[0], values[-1]
     if (found := _of_delay(plan_of, low, high)) is not None:
         return found, True
     first, last = stable(plan_of(low)), stable(plan_of(high))
-    if first is None or last is None:
-        return None, False
     if not first:
-        return None, True
+        return None, first is not None
     if last:
         return float("inf"), True
     while high - low > FINE * (values[-1] - values[0]):
         middle = (low + high) / 2
-        if (holds := stable(plan_of(middle))) is None:
-            return None, False
-        low, high = (middle, high) if holds else (low, middle)
-    return low, True
+        holds = stable(plan_of(middle))
+        if holds:
+            low = middle
+        else:
+            high, last = middle, holds
+    return low, last is not None
 
 
 def _of_delay(plan_of: PlanOf, low: float, high: float) -> float | None:
@@ -87,13 +92,12 @@ def _step(plan: Plan, other: Plan, at: int) -> int:
 
 
 def decay_rates(plan: Plan) -> Mapping[str, float]:
-    """Returns the decay rate of each block alone [1/s], in continuous time, with the delay of its loop; negative where errors
-    grow.
+    """Returns the decay rate of each block alone [1/s], without coupling, in continuous time, with the delay of its loop;
+    negative where errors grow.
 
     The delay of the loop is that from the robots up to the block's node and down again, of the slowest path, with the half
-    period less lead for which an acceleration is held.  Empty if blocks are coupled, or links are not steady or bring states to
-    the present."""
-    if plan.coupling.any() or untreated(plan):
+    period less lead for which an acceleration is held.  Empty if links are not steady or bring states to the present."""
+    if untreated(plan):
         return {}
     try:
         return {
@@ -153,8 +157,8 @@ def rightmost(gains: LinearGains, delay: float) -> float:
 
 
 def _differentiation(count: int) -> NDArray[np.float64]:
-    """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes cos(πk/N), k = 0 … N (Trefethen, Spectral
-    Methods in MATLAB, 2000)."""
+    """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes cos(πk/N), k = 0 … N (Trefethen,
+    Spectral Methods in MATLAB, 2000)."""
     nodes = np.cos(np.pi * np.arange(count + 1) / count)
     weight = np.where((np.arange(count + 1) % count) == 0, 2.0, 1.0) * (-1.0) ** np.arange(count + 1)
     gaps = nodes[:, None] - nodes[None] + np.eye(count + 1)

@@ -103,7 +103,7 @@ STUDY_FIGURES: Final[Mapping[str, StudyFigure]] = {
         lambda of: (
             f"Decay rate fitted to the amplitude of each block; median of {_runs(of)}; below zero errors grow."
             + (
-                " Dashed: predicted for the block alone, in continuous time, with its delays."
+                " Dashed: predicted for the block alone, in continuous time, with the delays of its loop."
                 if of.predicted.rates
                 else ""
             )

@@ -81,7 +81,14 @@ def study(options: StudyOptions) -> int:
         except OSError as error:
             raise UsageError(f"{error.filename or folder}: {error.strerror}") from None
         wrong += sum(not each.agrees for each in measured)
-        numbers = [{"says": each.number.says, "measured": each.value, "agrees": each.agrees} for each in measured]
+        numbers = [
+            {
+                "says": each.number.says,
+                "measured": each.value if each.value == each.value else None,
+                "agrees": each.agrees,
+            }
+            for each in measured
+        ]
         facts.append({"study": one.name, "page": str(folder / PAGE), "finding": one.finding, "numbers": numbers})
         if not options.json:
             print(f"{one.name}: {one.finding}")

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from echelon.errors import UsageError
+from echelon.shipped import FOLDER as SCENARIOS
 
-FOLDER: Final = Path(__file__).resolve().parents[2] / "deploy" / "studies"
+FOLDER: Final = SCENARIOS.parent / "studies"
 Kind = TypeVar("Kind")
 
 

@@ -16,6 +16,8 @@ SECONDS: Final = frozenset({
 """Last parts of keys whose values are in seconds"""
 HOLDS: Final = 0.5
 """A point holds if at least this share of its runs does"""
+MOST_LINES: Final = 4
+"""With so many values a second key is an axis of its own"""
 Columns = Mapping[str, NDArray[Any]]
 Kind = Literal["delay", "loss", "blackout", "other"]
 
@@ -146,15 +148,16 @@ class StudyResults:
 
     @property
     def second(self) -> Key | None:
-        """The other key with numbers, if there is one."""
+        """The other key with numbers, if there is one with `MOST_LINES` values or more."""
         axis = self.axis
-        others = [key for key in self.keys if key.numbers is not None and key.count > 1 and key is not axis]
+        others = [key for key in self.keys if key.numbers is not None and key.count >= MOST_LINES]
+        others = [key for key in others if axis is None or key.texts != axis.texts]
         return others[0] if others else None
 
     def others(self, *but: Key | None) -> list[Key]:
-        """Returns the keys that vary, but for these."""
-        names = [key.name for key in but if key is not None]
-        return [key for key in self.keys if key.count > 1 and key.name not in names]
+        """Returns the keys that vary, but for these, and for those that have the same value as one of these at each point."""
+        texts = [key.texts for key in but if key is not None]
+        return [key for key in self.keys if key.count > 1 and key.texts not in texts]
 
     def series(self, axis: Key, second: Key | None = None) -> list[Series]:
         """Returns the lines of a figure along an axis: one for each value of all other keys but `second`."""

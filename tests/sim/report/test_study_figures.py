@@ -14,6 +14,7 @@ from support.studies import BLOCKS, study
 
 DELAYS = [0.0, 0.1, 0.2, 0.3, 0.4]
 DELAY, LOSS = "links.uplink.delay", "links.uplink.loss"
+LOSSES = [0.0, 0.2, 0.4, 0.6]
 POLICIES = ["hold", "predict"]
 
 
@@ -34,8 +35,8 @@ def texts(results: StudyResults, name: str) -> list[str]:
     [
         (study({DELAY: DELAYS}), {"shares", "settling", "integrals"}),
         (study({DELAY: DELAYS}, rates=True), {"shares", "settling", "integrals", "rates", "ages"}),
-        (study({DELAY: DELAYS, LOSS: [0.0, 0.2, 0.4]}), {"map"}),
-        (study({DELAY: DELAYS, LOSS: [0.0, 0.2, 0.4]}, lambda d, p: d + p < 0.3), {"map", "tolerated"}),
+        (study({DELAY: DELAYS, LOSS: LOSSES}), {"map"}),
+        (study({DELAY: DELAYS, LOSS: LOSSES}, lambda d, p: d + p < 0.3), {"map", "tolerated"}),
         (study({DELAY: DELAYS, "links.uplink.policy": POLICIES}, lambda d, p: d < 0.2),
          {"shares", "tolerated", "settling", "integrals"}),
         (study({"events.0.duration": [0.5, 1.0, 2.0]}), {"shares", "settling", "integrals", "blackouts"}),
@@ -63,7 +64,7 @@ def test_lists_in_which_one_number_varies_are_an_axis_and_other_texts_are_not() 
 
 
 def test_delays_come_before_other_numbers_as_the_axis() -> None:
-    results = study({"law.epsilon.0": [0.1, 0.2, 0.3], DELAY: DELAYS})
+    results = study({"law.epsilon.0": [0.1, 0.2, 0.3, 0.4], DELAY: DELAYS})
     assert results.axis is not None
     assert results.second is not None
     assert (results.axis.name, results.second.name) == (DELAY, "law.epsilon.0")
@@ -83,15 +84,15 @@ def test_a_boundary_is_the_last_value_up_to_which_all_hold() -> None:
 
 
 def test_the_map_draws_the_measured_boundary_between_cells_and_the_predicted_one_over_it() -> None:
-    losses = [0.0, 0.2, 0.4]
+    losses = LOSSES
     predicted = Predicted(tuple(Boundary({LOSS: f"{loss:g}"}, 0.27 - 0.5 * loss) for loss in losses))
     results = study({DELAY: DELAYS, LOSS: losses}, lambda d, p: float(d + p < 0.35), predicted=predicted)
     (axes, *_) = drawn(results, "map").axes
-    assert len(axes.patches) == 15
+    assert len(axes.patches) == 20
     edges = [line.get_xydata().tolist() for line in axes.lines if len(line.get_xydata()) == 2]
     assert [[pytest.approx(0.35), pytest.approx(-0.1)], [pytest.approx(0.35), pytest.approx(0.1)]] in edges
-    (curve,) = (line for line in axes.lines if len(line.get_xydata()) == 3)
-    assert curve.get_xydata().tolist() == [[0.27, 0.0], [pytest.approx(0.17), 0.2], [pytest.approx(0.07), 0.4]]
+    (curve,) = (line for line in axes.lines if len(line.get_xydata()) == 4)
+    assert curve.get_xydata().tolist() == [[pytest.approx(0.27 - 0.5 * loss), loss] for loss in losses]
     assert curve.is_dashed()
     assert f"{DELAY} [s] = 0.3, {LOSS} = 0.2: 0 of 8 runs hold" in texts(results, "map")
 
@@ -107,12 +108,12 @@ def test_lines_have_gaps_where_runs_do_not_settle() -> None:
 
 
 def test_the_largest_delays_are_drawn_against_a_second_key_with_predictions_beside() -> None:
-    scales = [0.1, 0.2, 0.4]
+    scales = [0.1, 0.2, 0.3, 0.4]
     predicted = Predicted(tuple(Boundary({"law.epsilon": f"{e:g}"}, 0.7 * e) for e in scales))
     results = study({DELAY: DELAYS, "law.epsilon": scales}, lambda d, e: float(d < e), predicted=predicted)
     (axes,) = drawn(results, "tolerated").axes
-    measured, guessed = (line.get_xydata().tolist() for line in axes.lines if len(line.get_xydata()) == 3)
-    assert measured == [[0.1, 0.0], [0.2, 0.1], [0.4, 0.3]]
+    measured, guessed = (line.get_xydata().tolist() for line in axes.lines if len(line.get_xydata()) == 4)
+    assert measured == [[0.1, 0.0], [0.2, 0.1], [0.3, 0.2], [0.4, 0.3]]
     assert guessed == [[e, pytest.approx(0.7 * e)] for e in scales]
     assert "law.epsilon = 0.2: predicted: 0.14" in texts(results, "tolerated")
 

@@ -49,7 +49,9 @@ def test_a_boundary_is_found_to_the_step(edge: int) -> None:
 
 
 def test_both_judgements_have_boundaries_of_their_own() -> None:
-    by_share, by_moment, _ = searched("a=0:1:0.01", exact(lambda value: value < 0.705), exact(lambda value: value < 0.555))
+    by_share, by_moment, _ = searched(
+        "a=0:1:0.01", exact(lambda value: value < 0.705), exact(lambda value: value < 0.555)
+    )
     assert (by_share.value, by_share.fails) == (0.7, 0.71)
     assert (by_moment.value, by_moment.fails) == (0.55, 0.56)
 

@@ -11,6 +11,7 @@ For notebooks and scripts:
 
     echelon.load("lab")                     a scenario and the plan made from it
     echelon.open_run("runs/demo")           a run from its folder
+    echelon.open_run("runs/real").latencies()   of a run on a wall clock: how long messages took
     echelon.Simulation("lab")               a run step by step
     echelon.replay("runs/demo", {…})        its messages fed to roles with other values: where their outputs differ
     echelon.diff("runs/a", "runs/b")        where two runs part
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from echelon.sim.replay.comparison import ChannelComparison, Difference
     from echelon.sim.replay.difference import RunDifference
     from echelon.sim.replay.replay import Replay
+    from echelon.sim.results.latencies import Latencies, LinkLatency
     from echelon.sim.simulation import Simulation
     from echelon.sim.sweep.study import Sweep
 
@@ -43,7 +45,9 @@ __all__ = [
     "ChannelComparison",
     "Difference",
     "DriveProtocol",
+    "Latencies",
     "Law",
+    "LinkLatency",
     "Loaded",
     "Plant",
     "Replay",
@@ -85,6 +89,10 @@ def __getattr__(name: str) -> Any:
             from echelon.sim.replay.replay import Replay
 
             found = {"Replay": Replay}
+        case "Latencies" | "LinkLatency":
+            from echelon.sim.results.latencies import Latencies, LinkLatency
+
+            found = {"Latencies": Latencies, "LinkLatency": LinkLatency}
         case "RunDifference":
             from echelon.sim.replay.difference import RunDifference
 

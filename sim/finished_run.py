@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.bridge.referee.referee import read_run_log
+from echelon.errors import UserError
 from echelon.messages import STATE_FIELDS
 from echelon.plan.plan import Plan
 from echelon.sim.results.block_series import Blocks, BlockSeries, block_series
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from echelon.sim.report.drawing import Picture
+    from echelon.sim.results.latencies import Latencies
 
 Value = TypeVar("Value")
 Records = NDArray[np.void]
@@ -169,6 +171,16 @@ class Run:
     def links(self) -> tuple[LinkResult, ...]:
         """Counts and ages of messages on each link."""
         return self.summary.links
+
+    def latencies(self) -> "Latencies":
+        """Returns how long the messages of each link took in a run on a wall clock: `run.latencies().table.to_pandas()`.
+
+        Raises UserError if the run was in virtual time, or has no folder."""
+        from echelon.sim.measured_links import measured
+
+        if self.folder is None:
+            raise UserError("this run has no folder, so the arrivals of its messages were not noted")
+        return measured(self.folder)
 
     def figure(self, name: str) -> "Picture":
         """Returns a figure of the report: `trajectories`, `blocks`, `errors`, `distance` or `torques`.  Jupyter shows it; its

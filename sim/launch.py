@@ -41,6 +41,8 @@ class Launch:
     """Go on when a robot's state is not finite"""
     replace: bool = False
     """Delete the run of another scenario that is in `out`"""
+    observe: bool = False
+    """Open the run for observers, who can read and never write"""
 
     def __post_init__(self) -> None:
         for name, value, allowed in (
@@ -61,7 +63,7 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
     urls = bus_urls(plan, options.can, options.engine == "inprocess")
     _check(plan, options, urls)
     with ExitStack() as stack:
-        files = run_files(plan, bool(urls) or plan.can.closed)
+        files = run_files(plan, bool(urls) or plan.can.closed, options.observe)
         try:
             folder = stack.enter_context(out_folder(scenario.name, options.out, files, options.replace))
         except OSError as error:
@@ -90,6 +92,7 @@ def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, 
             display=display,
             stall_timeout_s=options.stall_timeout_s,
             keep_going=options.keep_going,
+            observe=options.observe,
         )
     except OSError as error:
         if error.filename is None:  # a write to an open file failed
@@ -120,6 +123,8 @@ def _check(plan: Plan, options: Launch, urls: Sequence[str]) -> None:
         raise UsageError(
             "--can virtual: is a bus inside one process; the closed torque path needs one between processes"
         )
+    if options.observe and options.engine == "inprocess":
+        raise UsageError("--observe: needs --engine processes; nobody can read a run in one process")
     if options.clock == "virtual" and not plan.can.virtual_drives:
         raise UsageError("can.virtual_drives = false: real drives need --clock wall")
 

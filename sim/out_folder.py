@@ -26,7 +26,9 @@ from echelon.bridge.stations.closed import LOG
 from echelon.errors import UsageError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
+from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.shipped import EFFECTIVE
+from echelon.sim.observing import TICKET
 from echelon.sim.run_state import STATE
 
 NOTE: Final = ".echelon.json"
@@ -37,13 +39,16 @@ SUMMARY: Final = "summary.json"
 REPORT: Final = "report.html"
 TABLES: Final = ("csv", "parquet")
 """Folders of exported tables"""
+TRACES: Final = "latencies"
+"""Folder of the traces that are made from a run's latencies (echelon.sim.measured_links)"""
 
 
-def run_files(plan: Plan, bus: bool) -> tuple[str, ...]:
+def run_files(plan: Plan, bus: bool, observed: bool = False) -> tuple[str, ...]:
     """Returns the names of the files that a run may write, except for the files of users' parts.
 
-    `bus` says whether the run makes CAN frames."""
-    return (EFFECTIVE, STATE, RECORDING, CUT, SUMMARY, REPORT, *((LOG, *dbc_names(plan)) if bus else ()))
+    `bus` says whether the run makes CAN frames, `observed` whether it is open to observers."""
+    with_bus = (LOG, *dbc_names(plan)) if bus else ()
+    return (EFFECTIVE, STATE, RECORDING, CUT, ARRIVALS, SUMMARY, REPORT, *with_bus, *((TICKET,) if observed else ()))
 
 
 @dataclass(slots=True)
@@ -172,7 +177,7 @@ def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
 
 def _misleading(path: Path) -> Iterator[str]:
     """Yields the names in a folder that look like files of a run.  Called when those of earlier runs are deleted already."""
-    stems = {name.partition(".")[0] for name in (RECORDING, SUMMARY, REPORT, LOG)} | {"torque", *TABLES}
+    stems = {name.partition(".")[0] for name in (RECORDING, SUMMARY, REPORT, LOG)} | {"torque", TRACES, *TABLES}
     for entry in sorted(path.iterdir()):
         if entry.name.partition(".")[0].partition("-")[0] in stems:
             yield entry.name

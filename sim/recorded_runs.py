@@ -2,6 +2,7 @@
 
 import platform
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -9,12 +10,14 @@ from typing import Final
 
 from echelon.errors import PartRunError, UsageError, UserError
 from echelon.plan.plan import Plan
+from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.shipped import EFFECTIVE, scenario_path
 from echelon.sim.kept_parts import HASH_OF
 from echelon.sim.out_folder import RECORDING
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
 from echelon.sim.parts.loading import load, parse
 from echelon.sim.parts.time_limit import TookTooLong
+from echelon.sim.recording.arrivals import read_arrivals
 from echelon.sim.recording.mcap_reader import read_metadata, read_scenario
 from echelon.sim.recording.messages import read_messages
 from echelon.sim.replay.difference import RunDifference, difference
@@ -33,7 +36,10 @@ def open_recorded(folder: Path) -> Recorded:
     path = folder / RECORDING
     try:
         _, plan = parse(read_scenario(path), str(path), folder=folder, trial=False)
-        return read_messages(path, plan)
+        recorded = read_messages(path, plan)
+        if recorded.by_arrival and (folder / ARRIVALS).exists():
+            return replace(recorded, arrivals=read_arrivals(folder / ARRIVALS, plan))
+        return recorded
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
     except (UserError, ValueError) as error:  # which begins with the file
@@ -107,7 +113,9 @@ def _remarks(recorded: Recorded, folder: Path) -> Iterator[str]:
             path = folder / Path(key.removeprefix(HASH_OF)).name
             if not path.is_file() or sha256(path.read_bytes()).hexdigest() != digest:
                 yield f"{path} is not the file that the run used"
-    if recorded.by_arrival:
+    if recorded.arrivals is not None and recorded.arrivals.damaged:
+        yield f"{folder / ARRIVALS}: is damaged; what stands behind the damage is left out"
+    if recorded.by_arrival and recorded.arrivals is None:
         yield (
             "on a wall clock: when each message arrived is not recorded, so the replay uses it at its nominal instant; outputs "
             "differ by what moves in the meantime, which --tolerance allows for"

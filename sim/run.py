@@ -58,13 +58,15 @@ def execute(
     display: Display,
     stall_timeout_s: float = 30.0,
     keep_going: bool = False,
+    observe: bool = False,
 ) -> tuple[Summary, Trace]:
     """Runs a plan and writes the files of the run, except for the report; returns its summary and its trace.
 
     `plan` is the plan of `scenario`, `out` the locked folder.  `engine` is `processes` or `inprocess`, `clock` is `virtual` or
     `wall`.  `can_urls` has a URL for each bus, or none if the run makes no frames.  A run in virtual time without progress for
     `stall_timeout_s` is given up.  A run ends at the first instant at which a robot's state is not finite, unless
-    `keep_going` is True.  A run that breaks off has its reason in the summary; its exception is not raised.
+    `keep_going` is True.  With `observe`, others can read the messages of a run as processes while it goes on.  A run that
+    breaks off has its reason in the summary; its exception is not raised.
 
     Raises OSError if a file cannot be written; in one process also OSError or ValueError if a bus cannot be opened."""
     begun, folder = datetime.now(UTC), out.path
@@ -86,7 +88,7 @@ def execute(
         recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files, keep_going)
         outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s)
     else:
-        outcome = Supervisor(
+        supervisor = Supervisor(
             plan,
             folder,
             run=blake2b(f"{folder.resolve()} {time.time_ns()}".encode(), digest_size=8).hexdigest(),
@@ -98,7 +100,12 @@ def execute(
             show=display.show,
             stall_timeout_s=stall_timeout_s,
             keep_going=keep_going,
-        ).run()
+            observe=observe,
+        )
+        if supervisor.ticket is not None:
+            supervisor.ticket.write(folder)
+            display.say(f"open to observers: echelon observe {folder}")
+        outcome = supervisor.run()
     can = outcome.can
     if can is not None and (can.referee is None or outcome.stopped):
         common_ns = outcome.trace.common_ns()

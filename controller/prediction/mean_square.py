@@ -57,7 +57,7 @@ def mean_square(plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float
     With `burst` they lose messages in bursts of this mean length, none between bursts and all within them (Gilbert).
 
     Raises PredictionError if nothing exact can be said of the plan, ValueError if there are no such links."""
-    losses = Losses(plan, _places(plan, links), burst)
+    losses = Losses(plan, places_of(plan, links), burst)
     at_own = losses.radius(losses.own)
     if losses.gain(0.0) >= 1:
         return LossBoundary(None, "unstable", burst, at_own)
@@ -91,20 +91,22 @@ class Losses:
         if in_bursts:
             self._chain = of_bursts(plan.links[in_bursts[0]])
             lossy, chained = lossy - {*in_bursts}, in_bursts
-        parts = RandomRun(plan, lossy, chained).parts()
-        if (largest := max(len(part.registers) for part in parts)) > LARGEST:
+        self.run = RandomRun(plan, lossy, chained)
+        self.parts = self.run.parts()
+        if (largest := max(len(part.registers) for part in self.parts)) > LARGEST:
             raise PredictionError(f"{largest} numbers act on each other, too many to compute losses with")
-        self._parts = different(parts, self._chances(ALIKE_AT))
+        self._different = different(self.parts, self.chances(ALIKE_AT))
 
     def gain(self, loss: float) -> float:
         """Returns a number that is below 1 if and only if errors vanish in the mean square."""
-        return max(SecondMoment(part, self._chances(loss)).gain() for part in self._parts)
+        return max(SecondMoment(part, self.chances(loss)).gain() for part in self._different)
 
     def radius(self, loss: float) -> float:
         """Returns the spectral radius of L."""
-        return max(SecondMoment(part, self._chances(loss)).radius() for part in self._parts)
+        return max(SecondMoment(part, self.chances(loss)).radius() for part in self._different)
 
-    def _chances(self, loss: float) -> Chances:
+    def chances(self, loss: float) -> Chances:
+        """Returns the chances with this loss on the links that are varied."""
         if self._burst is not None:
             return Chances.of(self._others, gilbert(loss, self._burst))
         losses = self._others.copy()
@@ -172,7 +174,7 @@ def _edge(gain: Callable[[float], float], low: float, high: float) -> float:
     return low
 
 
-def _places(plan: Plan, links: Sequence[LinkPlan] | Channel) -> list[int]:
+def places_of(plan: Plan, links: Sequence[LinkPlan] | Channel) -> list[int]:
     """Returns the places of links in `plan.links`."""
     some = ruled_links(plan, links) if isinstance(links, Channel) else links
     found = [at for at, link in enumerate(plan.links) if any(link is each for each in some)]

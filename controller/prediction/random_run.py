@@ -19,13 +19,12 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from echelon.controller.late_states import EXTRAPOLATE, PREDICT
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearStage
+from echelon.controller.prediction.policies import check_policy
 from echelon.controller.prediction.random_steps import Either, Indices, Linear, Step, Window, forced, needs
 from echelon.controller.prediction.registers import Registers, Role, Taking
 from echelon.messages import Channel
-from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import NodePlan, Plan
 from echelon.role import Input
@@ -182,8 +181,7 @@ def _waits(plan: Plan, random: frozenset[int]) -> bool:
             raise PredictionError(f"{name} links have delays that vary: losses are computed for constant delays")
         if at not in random and link.loss:
             raise PredictionError(f"{name} links lose messages in bursts of their own")
-        if link.policy in (EXTRAPOLATE, PREDICT) or link.timeout_ns < NEVER_NS:
-            raise PredictionError(f"{name} links have the policy {link.policy}: losses are computed for hold")
+        check_policy(plan, link)
     kinds = {node.event_driven for node in plan.nodes}
     if len(kinds) == 2:
         raise PredictionError(

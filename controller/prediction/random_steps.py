@@ -53,6 +53,12 @@ class Chances:
         """Number of modes of the chain."""
         return int(self.chain.shape[1])
 
+    def without_loss(self) -> Self:
+        """Returns the chances with which every message comes; the chain goes on as it does."""
+        chain = np.zeros_like(self.chain)
+        chain[0] = self.chain.sum(axis=0)
+        return type(self)(np.zeros_like(self.losses), chain)
+
     def stationary(self) -> Array:
         """Returns the stationary probabilities of the modes, (modes,)."""
         step = self.chain.sum(axis=0)

@@ -11,14 +11,14 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from echelon.controller.prediction.linear_roles import MOTION, LinearNode, LinearRobot, LinearStage, moved, powers_of
+from echelon.controller.prediction.policies import Block, Policies
 from echelon.controller.prediction.random_steps import Choice, Indices, Jump, Linear, Step
 from echelon.messages import Channel
 from echelon.plan.plan import Array, LinkPlan, Plan
 from echelon.role import Input
+from echelon.runtime.turns import Turn
 
 Role = LinearRobot | LinearNode
-Block = tuple[Indices, Indices, Array]
-"""Rows, columns, and the numbers of a matrix there"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,7 @@ class Registers:
         self._units: list[float] = []
         self._H = plan.root.period_ns * 1e-9
         self._kept = [self._keep(role) for role in self.roles]
+        self._policies = Policies(plan, self._new)
         self._at: dict[tuple[int, int, Channel], int] = {}
         self._held: dict[int, Indices] = {}
         self._wires: dict[tuple[int, Channel], _Wire] = {}
@@ -76,6 +77,19 @@ class Registers:
         """Returns the registers of the message of a link that is in use at its receiver."""
         return self._held[link]
 
+    def commanded(self) -> Indices:
+        """Returns the registers of all that goes down the tree: references, commands and torques, on their way and in use."""
+        down = (Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
+        wires = [place for (_, channel), wire in self._wires.items() if channel in down for place in wire.places]
+        held = [self._held[at] for (_, _, channel), at in self._at.items() if channel in down]
+        return np.concatenate([*wires, *held])
+
+    @property
+    def oldest(self) -> int:
+        """After how many hyperperiods a message has gone up the whole tree at the latest."""
+        longest = max(-(wire.first // wire.per_hyperperiod) for wire in self._wires.values())
+        return (1 + longest) * (1 + max(node.depth for node in self.plan.nodes))
+
     def acts(self, pairs: Sequence[tuple[Role, LinearStage]], time_ns: int, *, came: bool = False) -> list[Step]:
         """Returns the steps of stages of one level that are due at an instant, with what has come by then.  `came`: as far as
         all messages come."""
@@ -94,10 +108,7 @@ class Registers:
         """Returns the motion of robots for a while, under the commands in use."""
         T, blocks = span_ns * 1e-9, []
         for number in robots:
-            robot = self.plan.robots[number]
-            own = self.memory(number)
-            command = self._held[self._at[robot.parent, number, Channel.COMMAND]]
-            mine = command[2 * robot.child_number : 2 * robot.child_number + 2]
+            own, mine = self.memory(number), self._command(number)
             unit = np.eye(len(MOTION) + 2)
             blocks.append((own, np.r_[own, mine], moved(unit[: len(MOTION)], unit[len(MOTION) :], T)))
         return self._linear(blocks)
@@ -106,8 +117,9 @@ class Registers:
         """Returns the steps in which receivers take the messages that have come, the older ones first.
 
         `came`: as far as all messages come, with the probability of that; `certain`: no message is lost."""
+        before: list[Block] = []
         free: list[Block] = []
-        ranks: list[list[tuple[int, Indices]]] = []
+        ranks: list[list[tuple[int, Indices, Indices]]] = []
         for taking in takings:
             at = self.link(taking.receiver, taking.heard)
             link, wire = self.plan.links[at], self._wires[taking.heard.source, taking.heard.channel]
@@ -116,11 +128,14 @@ class Registers:
                 for rank, number in enumerate(numbers):
                     if rank == len(ranks):
                         ranks.append([])
-                    ranks[rank].append((at, wire.of(number)))
+                    taken = self._policies.taken(at, self._held[at], wire.of(number))
+                    before += taken.before
+                    ranks[rank].append((at, taken.dest, taken.source))
             elif numbers:
-                held = self._held[at]
-                free.append((held, wire.of(numbers[-1]), np.eye(len(held))))
-        steps: list[Step] = [self._linear(free)] if free else []
+                taken = self._policies.taken(at, self._held[at], wire.of(numbers[-1]))
+                before += taken.before
+                free.append((taken.dest, taken.source, np.eye(len(taken.dest))))
+        steps: list[Step] = [self._linear(blocks) for blocks in (before, free) if blocks]
         for drawn in ranks:
             steps += self._drawn(drawn, came=came)
         return steps
@@ -134,27 +149,28 @@ class Registers:
                 blocks.append((to, source, np.eye(len(to))))
         return self._linear(blocks)
 
-    def _drawn(self, drawn: Sequence[tuple[int, Indices]], *, came: bool) -> list[Step]:
-        """Returns the steps in which links, each by its place and the registers of its message, lose a message or not."""
+    def _drawn(self, drawn: Sequence[tuple[int, Indices, Indices]], *, came: bool) -> list[Step]:
+        """Returns the steps in which links, each by its place, lose a message or not; with each the registers that change if it
+        comes, and those whose values they take."""
         steps: list[Step] = []
-        chained = [(at, source) for at, source in drawn if at in self._chained]
+        chained = [(dest, source) for at, dest, source in drawn if at in self._chained]
         if chained:
-            dest = np.concatenate([self._held[at] for at, _ in chained])
-            steps.append(Jump(dest, (np.concatenate([source for _, source in chained]),), came))
+            dests, sources = (np.concatenate(each) for each in zip(*chained, strict=True))
+            steps.append(Jump(dests, (sources,), came))
         draws: dict[tuple[int, Channel] | int, int] = {}
         kinds: list[int] = []
         rows: list[tuple[Indices, Indices, Indices]] = []
-        for at, source in drawn:
+        for at, dest, source in drawn:
             if at in self._chained:
                 continue
             link = self.plan.links[at]
             draw = draws.setdefault((link.source, link.channel) if link.loss_of_message else at, len(draws))
             if draw == len(kinds):
                 kinds.append(at)
-            rows.append((self._held[at], source, np.full(len(source), draw)))
+            rows.append((dest, source, np.full(len(source), draw)))
         if rows:
-            dest, sources, draw_of = (np.concatenate(each) for each in zip(*rows, strict=True))
-            steps.append(Choice.of(dest, sources, draw_of, np.array(kinds), came=came))
+            dests, sources, draw_of = (np.concatenate(each) for each in zip(*rows, strict=True))
+            steps.append(Choice.of(dests, sources, draw_of, np.array(kinds), came=came))
         return steps
 
     def _keep(self, role: Role) -> dict[str, Indices]:
@@ -178,8 +194,10 @@ class Registers:
             if (link.source, link.receiver, link.channel) == (heard.source, receiver, heard.channel)
         )
         link, powers = self.plan.links[at], powers_of(self.plan, heard.source, heard.channel)
+        powers += self._policies.further(heard.source, heard.channel)
         self._at[heard.source, receiver, heard.channel] = at
         self._held[at] = self._new(powers)
+        self._policies.add(at, powers, self._new)
         wire = self._wires.setdefault((heard.source, heard.channel), _Wire(self.plan.root.period_ns // link.period_ns))
         while wire.first > min(0, _newest(link, -stage.timed.period_ns) + 1) or not wire.places:
             wire.add(self._new, powers)
@@ -205,8 +223,19 @@ class Registers:
         for channel, period_ns in stage.timed.says:
             wire = self._wires.get((stage.timed.member, channel))
             if wire is not None and time_ns % period_ns == 0:
-                blocks.append((wire.of(time_ns // period_ns), columns, said[channel]))
+                message, values = wire.of(time_ns // period_ns), said[channel]
+                blocks.append((message[: len(values)], columns, values))
+                if len(message) > len(values):  # a robot's acceleration, for the policy `extrapolate`
+                    blocks.append((message[len(values) :], self._command(stage.timed.member), np.eye(2)))
+        if stage.timed.turn is Turn.STEER:
+            blocks += self._policies.noted(stage.timed.member, next(iter(said.values())), columns)
         return blocks
+
+    def _command(self, number: int) -> Indices:
+        """Returns the registers of the acceleration that is commanded to a robot."""
+        robot = self.plan.robots[number]
+        command = self._held[self._at[robot.parent, number, Channel.COMMAND]]
+        return command[2 * robot.child_number : 2 * robot.child_number + 2]
 
     def _linear(self, blocks: Sequence[Block]) -> Linear:
         """Returns the step that sets the rows of blocks, and leaves the other registers as they are."""

@@ -48,12 +48,13 @@ def _blocks(found: "AnalysisResult") -> list[str]:
         )
         rate = "?" if one.decay_rate is None else f"{one.decay_rate:.4g} 1/s"
         turning = "" if not one.frequency else f"{one.frequency:.4g} rad/s"
-        return _counted(one.names), one.layer, f"{one.sigma:.4g} s", rate, turning, when, margin
+        cost = "?" if one.cost_share is None else f"{100 * one.cost_share:.3g} %"
+        return _counted(one.names), one.layer, f"{one.sigma:.4g} s", rate, turning, when, cost, margin
 
-    head = ("block", "layer", "σ", "decays at", "turns at", "settles", "delay alone")
+    head = ("block", "layer", "σ", "decays at", "turns at", "settles", "of the cost", "delay alone")
     return [
-        "  blocks: the slowest mode as sampled, when |e| settles to 2 % from the start, and the delay that the block alone "
-        "bears in continuous time",
+        "  blocks: the slowest mode as sampled, when |e| settles to 2 % from the start, the share of ∫|e|² dt, and the delay "
+        "that the block alone bears in continuous time",
         *_table(head, [row(one) for one in found.blocks]),
     ]
 
@@ -62,7 +63,9 @@ def _links(found: "AnalysisResult") -> list[str]:
     """Returns the tables of what links bear."""
     late = any(max(delays) > 0 for delays in found.delays.values())
     beyond = "beyond the scenario's delays" if late else "than now"
-    lines = [f"  how much later messages may be {beyond}, all links of a row together; how many may be lost"]
+    lines = [
+        f"  how much later messages may be {beyond}, or how many may be lost by chance, on all links of a row together"
+    ]
     classes = [one for one in found.table if one.kind == "class"]
     rows = [
         (one.layer or "", one.channel or "", _delay(one.delay), _ticks(one.delay), _loss(one.loss), _limit(one.delay))

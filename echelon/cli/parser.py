@@ -67,6 +67,12 @@ def _recordings() -> Commands:
     return COMMANDS
 
 
+def _observe() -> Commands:
+    from echelon.cli.observe import COMMANDS
+
+    return COMMANDS
+
+
 def _bus() -> Commands:
     from echelon.cli.bus import COMMANDS
 
@@ -106,6 +112,8 @@ ENTRIES: Final = {
     "recover": Entry("rebuild what a killed run left, or mend a recording that was cut off", _results),
     "replay": Entry("feed a run's messages to today's roles and say where their outputs differ", _recordings),
     "diff": Entry("say where two runs part: the first instant, message and value", _recordings),
+    "latencies": Entry("say how long messages took on a wall clock, and write traces of it", _recordings),
+    "observe": Entry("print the messages of a run that goes on", _observe),
     "drives": Entry("run the virtual drives of a scenario alone, to try hosts on", _bus),
     "can": Entry("show what is on a scenario's CAN buses, wheel by wheel", _bus),
     "referee": Entry("say what breaks the contract on a scenario's CAN buses", _bus),

@@ -1,4 +1,5 @@
-"""Commands that compare what was recorded: `replay` with today's roles, `diff` with another run."""
+"""Commands about what was recorded: `replay` compares it with today's roles, `diff` with another run; `latencies` says how long
+messages took."""
 
 import json
 from dataclasses import dataclass, field
@@ -61,6 +62,34 @@ def diff(options: DiffOptions) -> int:
     return 0 if found.equal else 1
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LatenciesOptions:
+    """Options of `echelon latencies`."""
+
+    run: Path = field(metadata=argument("the folder of a run on a wall clock", "RUN"))
+    out: Path | None = field(
+        default=None,
+        metadata=option("folder for the traces and the scenario (default: latencies in the run's folder)", "DIR"),
+    )
+    replace: bool = field(default=False, metadata=option("overwrite files of the same names"))
+    json: bool = field(default=False, metadata=JSON)
+
+
+def latencies(options: LatenciesOptions) -> int:
+    """Says how long the messages of a run took, and writes traces of it."""
+    from echelon.sim.measured_links import measured, write_traces
+    from echelon.sim.out_folder import TRACES
+
+    found = measured(options.run)
+    files = write_traces(options.run, found.arrivals, options.out or options.run / TRACES, replace=options.replace)
+    if options.json:
+        print(json.dumps({**found.to_json(), "files": list(map(str, files))}, indent=2, allow_nan=False))
+    else:
+        print(found)
+        print(f"written: {len(files) - 1} traces, and a scenario with them: echelon run {files[0]}")
+    return 0
+
+
 COMMANDS: Final[tuple[Command[Any], ...]] = (
     Command(
         name="replay",
@@ -71,8 +100,7 @@ Feeds the messages that a run recorded to today's robots and nodes, and compares
 with what was recorded.  With --set or --scenario it judges another law on the same data.
 Each role hears what was said then, not what others compute now, so a difference stays with the
 role that causes it.  Links with delay and loss deliver the same messages as in the run.
-On a wall clock the instants of arrival are not recorded: then the outputs agree to about what
-moves within a period, and --tolerance says how much of that counts as equal.
+On a wall clock they are delivered when they arrived then.
 Parts of yours are the copies in the run's folder; --scenario FILE takes those beside that file.""",
         examples={
             "echelon replay runs/demo": "the code of today says what was recorded",
@@ -97,5 +125,23 @@ CAN frames are not compared; of a closed torque path the torques are.""",
             "echelon diff runs/demo runs/avoiding --tolerance 1e-6": "smaller differences count as equal",
         },
         codes={0: "over the time that both recorded they are equal", 1: "they differ"},
+    ),
+    Command(
+        name="latencies",
+        options=LatenciesOptions,
+        work=latencies,
+        about="""\
+Says how long the messages of each link took in a run on a wall clock, and how many were lost:
+from the instant in the message's header to the one from which on its receiver used it.
+Writes a trace of the delays of each link, and a scenario whose links take them, message by
+message.  In virtual time that scenario gives the same run again: to the last bit where torque is
+mirrored.  Change it, and you see what another law does with the same network.""",
+        examples={
+            "echelon run lab --clock wall --out runs/real": "a run whose messages take real time",
+            "echelon latencies runs/real": "the table; traces and scenario.toml in runs/real/latencies",
+            "echelon run runs/real/latencies/scenario.toml": "the same run in virtual time",
+            "echelon latencies runs/real --json --out traces": "for scripts; files into a folder of yours",
+        },
+        codes={0: "written"},
     ),
 )

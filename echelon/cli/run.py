@@ -41,6 +41,10 @@ class RunOptions(ScenarioOptions):
     keep_going: bool = field(
         default=False, metadata=option("go on when a robot's state is not finite; without it the run stops there")
     )
+    observe: bool = field(
+        default=False,
+        metadata=option("let others read the run while it goes on (echelon observe); they can never write"),
+    )
     stall_timeout: float = field(
         default=30.0,
         metadata=option("in virtual time: give up a run that makes no progress for S seconds", "S", parse=seconds),
@@ -73,6 +77,7 @@ def run(options: RunOptions) -> int:
                 stall_timeout_s=options.stall_timeout,
                 keep_going=options.keep_going,
                 replace=options.replace,
+                observe=options.observe,
             ),
         )
     except OSError as error:

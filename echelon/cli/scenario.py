@@ -157,8 +157,12 @@ def dbc(options: DbcOptions) -> int:
 class SchemaOptions:
     """Options of `echelon schema`."""
 
-    what: Literal["scenario", "summary"] = field(
-        metadata=argument("scenario: the keys of scenario files; summary: those of a run's summary.json", "WHAT")
+    what: Literal["scenario", "summary", "analysis"] = field(
+        metadata=argument(
+            "scenario: the keys of scenario files; summary: those of a run's summary.json; analysis: those of "
+            "`echelon analyse --json`",
+            "WHAT",
+        )
     )
     markdown: bool = field(
         default=False, metadata=option("for scenario: print a reference page for people, in Markdown")
@@ -166,18 +170,20 @@ class SchemaOptions:
 
 
 def schema(options: SchemaOptions) -> int:
-    """Prints the schema of scenario files or of summary.json."""
+    """Prints the schema of scenario files, of summary.json or of an analysis."""
     from echelon.scenario.schema import reference_page, scenario_schema
     from echelon.sim.parts.loading import REGISTRY
-    from echelon.sim.results.rendering import summary_schema
+    from echelon.sim.results.rendering import analysis_schema, summary_schema
 
     if options.markdown and options.what != "scenario":
         raise UsageError(f"--markdown: is only for the schema of scenarios, not of {options.what}")
     if options.markdown:
         sys.stdout.write(reference_page(REGISTRY))
     else:
-        found = scenario_schema(REGISTRY) if options.what == "scenario" else summary_schema()
-        print(json.dumps(found, indent=2, ensure_ascii=False))
+        schemas = {
+            "scenario": lambda: scenario_schema(REGISTRY), "summary": summary_schema, "analysis": analysis_schema
+        }  # fmt: skip
+        print(json.dumps(schemas[options.what](), indent=2, ensure_ascii=False))
     return 0
 
 
@@ -245,14 +251,16 @@ and the like.  A run writes the same file into its folder.""",
         options=SchemaOptions,
         work=schema,
         about="""\
-Prints the JSON schema of scenario files, or that of summary.json.  With the schema an editor
-completes keys, shows what they mean, and marks mistakes.  In VS Code (Even Better TOML), in
+Prints the JSON schema of scenario files, of summary.json, or of what `echelon analyse --json`
+prints.  With the schema of scenarios an editor completes keys, shows what they mean, and marks
+mistakes.  In VS Code (Even Better TOML), in
 Helix and in Zed (taplo), this line at the top of a scenario names it:
   #:schema ./scenario.schema.json""",
         examples={
             "echelon schema scenario > scenario.schema.json": "for editors",
             "echelon schema scenario --markdown": "all keys with their defaults and units, for people",
             "echelon schema summary": "what is in the summary of a run",
+            "echelon schema analysis": "what `echelon analyse --json` prints",
         },
         codes={0: "printed"},
     ),

@@ -14,7 +14,7 @@ instant on, and nothing is drawn.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from typing import Final
 
 from echelon.messages import Channel, Message
@@ -63,6 +63,7 @@ class Link:
         "_copies",
         "_delivered",
         "_duplicates",
+        "_earliest",
         "_expected",
         "_fates",
         "_first_ns",
@@ -93,6 +94,8 @@ class Link:
         """Messages on their way, as a heap: instant of arrival and number"""
         self._copies: list[int] = []
         """Arrivals of second copies, as a heap"""
+        self._earliest: dict[int, int] = {}
+        """On a wall clock, when messages of `_flying` would arrive by the rule of the link, by number, where they came later"""
         self._age_sum = self._age_max = self._aged = 0
         self._ages = AgeCounts()
 
@@ -136,7 +139,7 @@ class Link:
             elif (message := came.get(number)) is None:
                 complete = False
                 still_open.append((number, earliest_ns))
-            elif not self._depart(message):
+            elif self._depart(message) is None:
                 self._lost += 1
                 del came[number]
         self._open = still_open
@@ -153,15 +156,17 @@ class Link:
                 self._lost += 1
             self._sent += 1
 
-    def _depart(self, message: Message, received_ns: int | None = None) -> bool:
-        """Puts a message on its way; returns False if it is lost.  It arrives at `received_ns` at the earliest."""
+    def _depart(self, message: Message, received_ns: int | None = None) -> int | None:
+        """Puts a message on its way; returns when it arrives, `received_ns` at the earliest, or None if it is lost."""
         sent_ns = message.time_ns
         arrivals: Sequence[int] = [sent_ns + delay for delay in self._fates.of(message.sequence, sent_ns)]
         if not arrivals:
-            return False
+            return None
         if len(arrivals) > 1:
             arrivals = sorted(arrivals)
         if received_ns is not None:
+            if arrivals[0] < received_ns:
+                self._earliest[message.sequence] = arrivals[0]
             arrivals = [max(received_ns, arrival) for arrival in arrivals]
         if self.plan.fifo:
             arrivals = [max(self._latest_ns, arrival) for arrival in arrivals]
@@ -169,7 +174,7 @@ class Link:
         heappush(self._flying, (arrivals[0], message.sequence))
         for arrival in arrivals[1:]:
             heappush(self._copies, arrival)
-        return True
+        return arrivals[0]
 
     def expected(self, time_ns: int) -> int:
         """Returns the number of the newest message that would have arrived by `time_ns` if all were sent when they are due."""
@@ -184,9 +189,9 @@ class Link:
             self._open = still_open
         return self._expected
 
-    def receive(self, message: Message, time_ns: int) -> bool:
-        """Takes a message that comes at `time_ns` of a wall clock: it arrives then, or after the delay of its link.  Returns
-        False if it is lost."""
+    def receive(self, message: Message, time_ns: int) -> int | None:
+        """Takes a message that comes at `time_ns` of a wall clock.  Returns when it arrives: then, or after the delay of its
+        link; None if it is lost."""
         return self._depart(message, time_ns)
 
     def newest(self, time_ns: int) -> int:
@@ -194,6 +199,7 @@ class Link:
         flying, copies = self._flying, self._copies
         while flying and flying[0][0] <= time_ns:
             _, sequence = heappop(flying)
+            self._earliest.pop(sequence, None)
             self._delivered += 1
             if sequence > self.latest:
                 self.latest = sequence
@@ -204,7 +210,30 @@ class Link:
 
     def next_arrival(self, than: int) -> int | None:
         """Returns the first instant at which a message arrives that is newer than number `than`, of those on their way."""
-        return min((arrives_ns for arrives_ns, number in self._flying if number > than), default=None)
+        flying = self._flying
+        if flying and flying[0][1] > than:
+            return flying[0][0]
+        return min((arrives_ns for arrives_ns, number in flying if number > than), default=None)
+
+    def hasten(self, time_ns: int) -> list[int]:
+        """Lets messages that have come after `time_ns` of a wall clock arrive then, if they were sent by then and the rule of
+        the link allows it; returns their numbers."""
+        flying, earliest = self._flying, self._earliest
+        if not earliest:
+            return []
+        hastened = [
+            number
+            for arrives_ns, number in flying
+            if arrives_ns > time_ns and earliest.get(number, arrives_ns) <= time_ns
+        ]
+        if hastened:
+            flying[:] = [(time_ns if number in hastened else arrives_ns, number) for arrives_ns, number in flying]
+            heapify(flying)
+        return hastened
+
+    def arrival(self, sequence: int) -> int | None:
+        """Returns when message number `sequence` arrives, if it is on its way."""
+        return next((arrives_ns for arrives_ns, number in self._flying if number == sequence), None)
 
     def note_use(self, time_ns: int, sequence: int, sent_ns: int) -> None:
         """Counts a use at `time_ns` of message number `sequence`, which was sent at `sent_ns`."""

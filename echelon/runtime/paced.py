@@ -3,6 +3,9 @@
 A stage runs in Zenoh's thread, with the message that completes its inputs.  The main thread wakes at each instant and each
 deadline.  A stage whose deadline has come runs with the newest messages that have come, and is counted as late if one was
 missing (`echelon.runtime.mailbox.WallMailbox`).
+
+In run time a stage acts in the instant in which the message arrives that completes its inputs, or at its deadline, even if the
+process gets to it later.  So what it takes to compute is part of the time that its messages take.
 """
 
 import time
@@ -10,27 +13,32 @@ import time
 from echelon.messages import Message
 from echelon.plan.plan import Plan
 from echelon.role import Acts, Role, Stage
-from echelon.runtime.mailbox import WallMailbox
+from echelon.runtime.arrivals import END, FLUSH_NS, ArrivalFile, pack_arrival
+from echelon.runtime.mailbox import WallMailbox, allowed_ns
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
-from echelon.runtime.turns import deadline_ns
 
 
 class PacedRunner(Runner):
-    """One role of a plan on a wall clock."""
+    """One role of a plan on a wall clock.  It notes the arrivals of its messages in `arrivals`, if that is given."""
 
-    def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool) -> None:
-        self._inbox = WallMailbox(role, plan)
+    def __init__(
+        self,
+        role: Role,
+        plan: Plan,
+        session: Session,
+        run: str,
+        *,
+        watched: bool,
+        arrivals: ArrivalFile | None = None,
+    ) -> None:
+        self._inbox = WallMailbox(role, plan, noted=arrivals is not None)
+        self._arrivals = arrivals
+        self._written_ns = 0  # run time of the last write of arrivals
         self._started = False
         self._start_ns = 0  # run time 0 in `time.monotonic_ns`
         self._has_acted = False  # the stage at `_at` has acted, and acts again when something arrives
-        self._changed_ns = 0  # run time of its last act
-        self._allowed_ns = [
-            deadline_ns(plan, stage.turn, stage.depth, stage.period_ns)
-            if stage.acts in (Acts.IN_TURN, Acts.AT_INSTANT)
-            else stage.period_ns - 1
-            for stage in role.stages
-        ]
+        self._allowed_ns = [allowed_ns(plan, stage) for stage in role.stages]
         """For each stage how long after it is due it acts at the latest [ns]"""
         super().__init__(role, plan, session, run, self._inbox, watched=watched, batch_bytes=0)
 
@@ -49,6 +57,7 @@ class PacedRunner(Runner):
                 raise self._failure
             if self._finished:
                 return
+            self._write_arrivals(FLUSH_NS)
             self._rest(wake_ns)
 
     def _pace(self) -> int:
@@ -73,7 +82,8 @@ class PacedRunner(Runner):
                     counts.stages += 1
                     if stage.inputs:
                         counts.latest_ns = max(counts.latest_ns, now_ns - deadline_ns)
-                    self._act(number, stage, now_ns)
+                    mailbox.hasten(number, ready_ns)
+                    self._act(number, stage, ready_ns)
                 if stage.acts is Acts.ON_ARRIVAL and due_ns < self.plan.duration_ns:
                     self._has_acted = True
                     wake_ns = self._on_arrivals(number, stage)
@@ -88,24 +98,22 @@ class PacedRunner(Runner):
                 self._copies.send()
         return start_ns + self._time_ns
 
-    def _act(self, number: int, stage: Stage, now_ns: int) -> None:
-        """Lets a stage act now, at a run time within the period that began when it was due."""
-        at_ns = due_ns = self._time_ns
-        if stage.acts in (Acts.WHEN_HEARD, Acts.ON_ARRIVAL):
-            at_ns = min(max(now_ns, due_ns), due_ns + stage.period_ns - 1)
-        self._changed_ns = max(at_ns, now_ns)
-        for message in stage.run(at_ns, self._inbox.take(number, self._changed_ns)):
+    def _act(self, number: int, stage: Stage, ready_ns: int) -> None:
+        """Lets a stage act with what it hears at `ready_ns`, even if that is over."""
+        at_ns = self._inbox.instant(number, self._time_ns, ready_ns)
+        for message in stage.run(at_ns, self._inbox.hear(number, ready_ns)):
             self._send(message)
 
     def _on_arrivals(self, number: int, stage: Stage) -> int | None:
         """Lets a stage act on what has arrived since its last act; returns the run time at which this must be called again, or
         None if its period is over."""
-        end_ns = self._time_ns + stage.period_ns
-        while (now_ns := time.monotonic_ns() - self._start_ns) < end_ns:
-            change_ns = self._inbox.next_change(number, self._changed_ns)
-            if change_ns > now_ns:
-                return min(change_ns, end_ns)
-            self._act(number, stage, now_ns)
+        last_ns = self._inbox.last_ns(number, self._time_ns)
+        while (change_ns := self._inbox.next_act(number)) <= last_ns:
+            if change_ns > time.monotonic_ns() - self._start_ns:
+                return change_ns
+            self._act(number, stage, change_ns)
+        if time.monotonic_ns() - self._start_ns <= last_ns:
+            return last_ns + 1
         self.counts.late += self._inbox.misses(number, self._time_ns)
         return None
 
@@ -116,6 +124,23 @@ class PacedRunner(Runner):
     def _go_on(self) -> None:
         if self._started and self._failure is None:
             self._pace()
+
+    def _write_arrivals(self, after_ns: int) -> None:
+        """Writes the arrivals that are not in the file yet, if the last time was `after_ns` ago."""
+        now_ns = time.monotonic_ns() - self._start_ns
+        if self._arrivals is None or now_ns - self._written_ns < after_ns:
+            return
+        self._written_ns = now_ns
+        with self._lock:
+            records, self._inbox.arrivals = bytes(self._inbox.arrivals or b""), bytearray()
+        self._arrivals.write(records)
+
+    def finish(self) -> None:
+        super().finish()
+        self._write_arrivals(0)
+        if self._arrivals is not None:
+            self._arrivals.write(pack_arrival(END, self.role.index, self._time_ns, self._time_ns))
+            self._arrivals.close()
 
     def _rest(self, until_ns: int) -> None:
         """Sleeps until an instant of `time.monotonic_ns`, or until the main thread has work."""

@@ -18,6 +18,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from types import TracebackType
 from typing import Final, Self
 
@@ -28,6 +29,8 @@ os.environ.setdefault(
 )
 
 import zenoh
+
+from echelon.runtime.credentials import Credentials
 
 Receive = Callable[[bytes], None]
 """Handler of one payload, called in Zenoh's thread.  While it runs nothing else is received, so it must not wait for a later
@@ -141,9 +144,17 @@ class Session:
     """
 
     def __init__(
-        self, *, listen: Sequence[str], connect: Sequence[str], lockstep: bool, own_receiver: bool = False
+        self,
+        *,
+        listen: Sequence[str],
+        connect: Sequence[str],
+        lockstep: bool,
+        own_receiver: bool = False,
+        credentials: Credentials | None = None,
     ) -> None:
-        """`own_receiver` gives receiving a thread of its own, so that sending goes on while a full inbox blocks receiving.  A
+        """With `credentials` nobody else is let in or heard.
+
+        `own_receiver` gives receiving a thread of its own, so that sending goes on while a full inbox blocks receiving.  A
         process needs it if it both sends and has an inbox in lockstep.  Only a process's first session can set it."""
         if lockstep:
             _prefer_throughput()
@@ -151,7 +162,7 @@ class Session:
             runtime = os.environ["ZENOH_RUNTIME"]
             os.environ["ZENOH_RUNTIME"] = runtime.replace("rx:(handover:app)", "rx:(worker_threads:1)")
         self._lockstep = lockstep
-        self._session = _open(listen, connect, lockstep)
+        self._session = _open(listen, connect, lockstep, credentials)
         self._inboxes: list[Inbox] = []
         self._kept: list[object] = []  # references that keep all declarations alive as long as the session
 
@@ -202,10 +213,16 @@ class Session:
         return tokens
 
     def close(self) -> None:
-        """Delivers all that was put, then ends the connection.  A handler must not call it."""
+        """Delivers all that was put, then ends the connection.  A handler must not call it.
+
+        On a wall clock it gives up on a receiver that stands still."""
         for inbox in self._inboxes:
             inbox._let_go()
-        self._session.close()  # type: ignore[no-untyped-call]
+        try:
+            self._session.close()  # type: ignore[no-untyped-call]
+        except zenoh.ZError:  # it took too long
+            if self._lockstep:
+                raise
 
     def __enter__(self) -> Self:
         return self
@@ -237,7 +254,9 @@ def _prefer_throughput() -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zenoh.Session:
+def _open(
+    listen: Sequence[str], connect: Sequence[str], lockstep: bool, credentials: Credentials | None
+) -> zenoh.Session:
     """Returns an open Zenoh session.  Raises ValueError for a wrong endpoint."""
     for endpoint in [*listen, *connect]:
         _check(endpoint)
@@ -262,13 +281,15 @@ def _open(listen: Sequence[str], connect: Sequence[str], lockstep: bool) -> zeno
         # A peer that stands still is waited for, and what was put for it is kept; the run's supervisor decides when to give up.
         settings["transport/link/tx/lease"] = LEASE_MS
         settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = LEASE_MS * 1000
-    config = zenoh.Config()
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise ValueError(f"cannot listen on {', '.join(listen) or 'nothing'}: {error}") from error
+    secret = nullcontext(dict[str, object]()) if credentials is None else credentials.settings()
+    with secret as secrets:
+        config = zenoh.Config()
+        for name, value in (settings | secrets).items():
+            config.insert_json5(name, json.dumps(value))
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            raise ValueError(f"cannot listen on {', '.join(listen) or 'nothing'}: {error}") from error
 
 
 def _check(endpoint: str) -> None:

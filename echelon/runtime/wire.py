@@ -101,6 +101,13 @@ def split(batch: bytes) -> list[bytes]:
     return payloads
 
 
+def run_keys(run: str) -> tuple[str, ...]:
+    """Returns key expressions that together cover all keys of a run.
+
+    In Zenoh a wildcard does not match a chunk that begins with `@`."""
+    return tuple(f"echelon/{run}/{part}**" for part in ("", "@alive/", "@watch/", "@bridge/", "@drives/"))
+
+
 def data_key(run: str, path: str, channel: Channel) -> str:
     """Returns the key of a member's messages on a channel, e.g. `echelon/lab-7f3a/g1/r3/state`; the root's path is empty."""
     return "/".join(chunk for chunk in ("echelon", run, path, channel.name.lower()) if chunk)

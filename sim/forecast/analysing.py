@@ -6,11 +6,13 @@ from typing import Final
 
 from echelon.controller.prediction.analysis import Analysis, analyse
 from echelon.controller.prediction.block_margin import delay_margin
+from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError, linear_gains
 from echelon.controller.prediction.largest_delay import LargestDelay, largest_extra_delay
-from echelon.controller.prediction.linear_run import Edges
+from echelon.controller.prediction.linear_run import Edges, edge_of
 from echelon.controller.prediction.link_sets import LinkSet, link_sets
 from echelon.controller.prediction.lyapunov import lyapunov_bounds
+from echelon.controller.prediction.mean_square import mean_square
 from echelon.controller.prediction.modes import block_modes
 from echelon.controller.prediction.sampled_limits import coupling_limit, epsilon_range
 from echelon.controller.prediction.time_scales import (
@@ -30,12 +32,15 @@ from echelon.sim.results.analysis import (
     DelayResult,
     EpsilonResult,
     LinksResult,
+    LossResult,
     ModesResult,
     ScaledDelays,
     SettlingResult,
     TorqueLoopResult,
 )
 
+MOST: Final = 30
+"""Largest number of robots for which losses and costs are computed"""
 OF_MEMBERS: Final = ("group", "robot")
 Say = Callable[[str, int, int], None]
 """What is being computed, how many parts are done, and how many there are"""
@@ -126,24 +131,38 @@ def _table(plan: Plan, members: bool, say: Say) -> Iterable[LinksResult]:
     """Yields what sets of links bear; the same links are computed once."""
     sets = [one for one in link_sets(plan) if members or one.kind not in OF_MEMBERS]
     known: dict[Edges, LargestDelay] = {}
+    count = len(plan.robots)
     for done, one in enumerate(sets):
         say(one.name, done, len(sets))
         if one.edges not in known:
             known[one.edges] = largest_extra_delay(plan, one.edges)
-        yield _links(one, known[one.edges])
+        loss = None
+        if one.kind == "class":
+            why = f"only computed for up to {MOST} robots, here are {count}" if count > MOST else ""
+            loss = LossResult(None, "not computed", False, why) if why else _loss(plan, one.edges)
+        yield _links(one, known[one.edges], loss)
 
 
-def _links(one: LinkSet, found: LargestDelay) -> LinksResult:
+def _loss(plan: Plan, edges: Edges) -> LossResult:
+    """Returns how many messages of some links may be lost in the mean square."""
+    try:
+        found = mean_square(plan, [link for link in plan.links if edge_of(link) in edges])
+    except PredictionError as error:
+        return LossResult(None, "not computed", False, str(error))
+    return LossResult(found.loss, found.ends, found.estimate, "")
+
+
+def _links(one: LinkSet, found: LargestDelay, loss: LossResult | None = None) -> LinksResult:
     channel = None if one.channel is None else one.channel.name.lower()
     seconds = None if found.seconds is None else _finite(found.seconds)
     delay = DelayResult(seconds, found.ticks, found.tick_s, found.ends, found.tried, found.limits)
-    return LinksResult(one.kind, one.name, one.layer, channel, len(one.edges), one.like, delay, None)
+    return LinksResult(one.kind, one.name, one.layer, channel, len(one.edges), one.like, delay, loss)
 
 
 def _modes(plan: Plan) -> Iterable[ModesResult]:
     """Yields the modes of the blocks; blocks that are alike once."""
     of_name = {block.name: block for block in plan.blocks}
-    hyperperiod = plan.root.period_ns * 1e-9
+    hyperperiod, shares = plan.root.period_ns * 1e-9, _cost_shares(plan)
     for one in block_modes(plan):
         rate = one.rate(hyperperiod)
         yield ModesResult(
@@ -156,7 +175,19 @@ def _modes(plan: Plan) -> Iterable[ModesResult]:
             tuple((each.real, each.imag) for each in one.eigenvalues),
             None if rate is None else -rate.real,
             None if rate is None else abs(rate.imag),
+            sum(shares[name] for name in one.names) if shares else None,
         )
+
+
+def _cost_shares(plan: Plan) -> dict[str, float]:
+    """Returns the share of each block in the expected cost of the run; empty if it is not computed."""
+    if len(plan.robots) > MOST:
+        return {}
+    try:
+        cost = expected_cost(plan)
+    except PredictionError:
+        return {}
+    return {} if cost is None else {block.name: block.share for block in cost.blocks}
 
 
 def _time_scales(

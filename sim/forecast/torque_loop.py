@@ -49,7 +49,10 @@ class TorqueLoop:
 
 def torque_loops(plan: Plan, speeds: list[float]) -> tuple[TorqueLoop, ...]:
     """Returns the torque loops of all robots; `speeds` are those asked of them [m/s]."""
-    late = {link.source: link.delay_max_ns for link in plan.links if link.channel is Channel.TORQUE}
+    late: dict[int, int] = {}
+    for link in plan.links:
+        if link.channel is Channel.TORQUE:
+            late[link.source] = max(link.delay_max_ns, late.get(link.source, 0))
     known: dict[tuple[object, ...], tuple[float, float | None]] = {}
     found = []
     for robot, speed in zip(plan.robots, speeds, strict=True):

@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import Final
 
 from echelon.plan.plan import Plan
+from echelon.runtime.credentials import Credentials
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
 from echelon.runtime.session import Session
 from echelon.runtime.wire import SCHEMA_VERSION, token_key
+from echelon.sim.observing import Gate
 from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Ready, Report
 
@@ -36,7 +38,7 @@ class ProcessSpec:
     run: str
     """Name of the run, which no other run has"""
     kind: str
-    """`robot`, `leader`, `coordinator`, `recorder`, `bridge`, `drives` or `referee`"""
+    """`robot`, `leader`, `coordinator`, `recorder`, `observers`, `bridge`, `drives` or `referee`"""
     name: str
     index: int
     """Index of its role in the plan; for recorder, referee and the bridge of a mirrored path a number that is not used"""
@@ -49,10 +51,16 @@ class ProcessSpec:
     """Endpoints of other processes to which its session connects"""
     peers: tuple[tuple[str, str], ...]
     """(kind, name) of the processes whose tokens it waits for"""
+    credentials: Credentials
+    """Its secrets, and who the processes at these endpoints are"""
+    gate: Gate | None = None
+    """Where the process `observers` lets observers in"""
     watched: bool = True
     """True: its messages also go to watchers"""
     member: bool = True
     """True: it ends by itself when the run is over.  False: it waits for the order to finish"""
+    recorded: bool = False
+    """True: the run is recorded into `folder`"""
     folder: str = ""
     can_urls: tuple[str, ...] = ()
     """A URL for each bus of the plan; empty: no bus"""

@@ -16,11 +16,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from io import TextIOWrapper
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Final
 
 from echelon.errors import PartRunError
 from echelon.messages import Heard, Message
 from echelon.role import Role
+from echelon.runtime.arrivals import ArrivalFile
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.paced import PacedRunner
@@ -56,10 +58,12 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         sys.stdout.reconfigure(line_buffering=True)  # a process may end without writing what is left
     body: Body
     try:
-        if not spec.virtual and spec.kind == "recorder":
+        if not spec.virtual and spec.kind in ("recorder", "observers"):
             os.nice(10)  # this process can wait, others cannot
         if spec.kind == "recorder":
             from echelon.sim.processes.watchers import run_recorder as body
+        elif spec.kind == "observers":
+            from echelon.sim.processes.observers import run_observers as body
         elif spec.kind in ("bridge", "drives", "referee"):
             from echelon.sim.processes.bus_processes import body_of
 
@@ -89,7 +93,8 @@ def _open(spec: ProcessSpec) -> Session:
             listen=spec.listen,
             connect=spec.connect,
             lockstep=spec.virtual,
-            own_receiver=spec.kind == "bridge" and not spec.member,
+            own_receiver=spec.kind == "observers" or (spec.kind == "bridge" and not spec.member),
+            credentials=spec.credentials,
         )
     except ValueError as error:
         raise StartError(str(error)) from None
@@ -122,8 +127,15 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
             control.send(said)
 
     role = _LinkTeller(make_role(spec.plan, spec.index), say)
-    make = LockstepRunner if spec.virtual else PacedRunner
-    runner = make(role, spec.plan, session, spec.run, watched=spec.watched)
+    runner: LockstepRunner | PacedRunner
+    if spec.virtual:
+        runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched)
+    else:
+        try:
+            arrivals = ArrivalFile(Path(spec.folder)) if spec.recorded else None
+        except OSError as error:
+            raise StartError(f"{error.filename}: {error.strerror}") from None
+        runner = PacedRunner(role, spec.plan, session, spec.run, watched=spec.watched, arrivals=arrivals)
     role.counts = runner.mailbox.counts
     start_ns = meet(spec, session, control)
     signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())

@@ -25,6 +25,8 @@ from typing import Any, Final
 
 from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
+from echelon.runtime.arrivals import FILE as ARRIVALS
+from echelon.sim.observing import new_gate
 from echelon.sim.processes.children import Child, last_words_of, list_specs, start
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.endings import finish_watchers, stop_members, take_down
@@ -60,7 +62,8 @@ class Supervisor:
     clock.  `can_urls` has a URL for each bus; without it there are no frames.  `scenario_toml`, `metadata` and `part_files`
     (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
     five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up.  With `keep_going` the run
-    does not stop when a robot's state is not finite.  `order` may change the order in which processes start."""
+    does not stop when a robot's state is not finite.  With `observe` it is open to observers, who get the `ticket`.  `order`
+    may change the order in which processes start."""
 
     def __init__(
         self,
@@ -77,18 +80,27 @@ class Supervisor:
         show: Callable[[Progress], None] = lambda progress: None,
         stall_timeout_s: float = 30.0,
         keep_going: bool = False,
+        observe: bool = False,
         order: Callable[[list[ProcessSpec]], list[ProcessSpec]] = lambda specs: specs,
     ) -> None:
         self.plan, self.virtual = plan, virtual
+        self._folder, self._notes_arrivals = folder, recorded and not virtual
         self.progress = Progress()
         self._show = show
         told = scenario_toml, metadata or {}, part_files or {}
-        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going))
+        gate = new_gate(run) if observe else None
+        self.ticket = None if gate is None else gate.ticket
+        """What observers need to know; None if the run is not open to them"""
+        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going, gate))
         self._children: list[Child] = []
         self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)
 
     def run(self) -> Outcome:
-        """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised."""
+        """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised.
+
+        Raises OSError if the file of arrivals cannot be made."""
+        if self._notes_arrivals:
+            (self._folder / ARRIVALS).write_bytes(b"")  # members append to it
         begun_s = time.monotonic()
         failure: str | None = None
         stall: StallError | None = None

@@ -30,6 +30,8 @@ SLACK_NS: Final = 60_000_000_000
 """On a wall clock, messages with times up to this long after the end of the run are accepted."""
 HIGH_WATER: Final = 256
 """How many batches a watcher may be behind before the run waits for it."""
+WALL_HIGH_WATER: Final = 1 << 15
+"""On a wall clock nothing waits: how many batches a watcher may be behind before it loses the oldest ones; some seconds"""
 DRAIN_S: Final = 10.0
 """How long a watcher waits for the missing messages of a finished run."""
 SILENCE_S: Final = 0.3
@@ -89,7 +91,8 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> No
     """Runs the recorder: writes messages to run.mcap and into the trace; sends progress and the trace to the supervisor."""
     plan = spec.plan
     sources = speakers(plan, spec.virtual, bool(spec.can_urls))
-    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER), sources, plan)
+    high_water = HIGH_WATER if spec.virtual else WALL_HIGH_WATER
+    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), high_water), sources, plan)
     try:
         recording = RunRecorder(
             Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files, spec.keep_going

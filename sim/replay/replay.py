@@ -145,7 +145,8 @@ class Replaying:
         if self._until_ns <= 0:
             raise UsageError("the recording lacks messages from the start: nothing can be replayed")
         self._until_s = last_instant_ns(plan, self._until_ns) / 1e9
-        self._feeding = Feeding(plan, recorded, indices, self._until_ns)
+        self._heard_until_ns = {index: min(recorded.heard_until_ns(index), self._until_ns) for index in indices}
+        self._feeding = Feeding(plan, recorded, self._heard_until_ns)
 
     def instants(self) -> Iterator[int]:
         """Feeds all roles; yields an instant [ns] when a role is done with it.  Raises PartRunError if a part fails."""
@@ -158,8 +159,9 @@ class Replaying:
         for index in self._indices:
             for channel in message_sizes_of(plan, plan.formation[index]):
                 key, names = (index, channel), value_names(plan, index, channel)
-                said = self._recorded.series.get(key, _nothing(*key, len(names))).before(self._until_ns)
-                now = computed.get(key, _nothing(*key, len(names))).before(self._until_ns)
+                until_ns = self._heard_until_ns[index]
+                said = self._recorded.series.get(key, _nothing(*key, len(names))).before(until_ns)
+                now = computed.get(key, _nothing(*key, len(names))).before(until_ns)
                 channels.append(
                     compare(
                         plan,
@@ -185,6 +187,14 @@ class Replaying:
             why = "is cut off" if recorded.cut else "lacks messages"
             until = f"{self._until_s:.9g} s of {self._plan.duration_ns / 1e9:g} s"
             yield f"the recording {why}: it is whole up to t = {until}, and nothing is compared from there on"
+        short = {index: end_ns for index, end_ns in self._heard_until_ns.items() if end_ns < until_ns}
+        if short:
+            index, end_ns = min(short.items(), key=lambda each: each[1])
+            others = f", and of {len(short) - 1} more not to the end either" if len(short) > 1 else ""
+            yield (
+                f"not all that roles heard is known: of {self._plan.formation[index].name} outputs are compared up to "
+                f"t = {max(end_ns, 0) / 1e9:.9g} s{others}"
+            )
         if self._plan.bus_roles:
             yield "bridge and drives are not replayed: robots get the wheel torques that the bridge reported then"
 

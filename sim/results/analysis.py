@@ -95,6 +95,9 @@ class ModesResult:
     """Rate at which its slowest sampled mode decays [1/s]; negative if it grows"""
     frequency: float | None
     """Angular frequency of this mode [rad/s]"""
+    cost_share: float | None
+    """Share of these blocks in the integral of the expected squared errors, from the scenario's start (docs/architecture.md,
+    2.11); None: not computed"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,9 @@ from math import gcd
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.messages import Channel
+from echelon.messages import NULL, Channel, Message
 from echelon.plan.plan import Plan
+from echelon.sim.results.arrivals import Arrivals
 from echelon.sim.results.trace import Array
 
 
@@ -51,6 +52,8 @@ class Recorded:
     """The effective scenario as TOML, as the recording has it"""
     cut: bool
     """True if the file is cut off, so that its end is missing"""
+    arrivals: Arrivals | None = None
+    """On a wall clock when messages arrived; None in virtual time, and if it was not noted"""
 
     @property
     def by_arrival(self) -> bool:
@@ -61,6 +64,32 @@ class Recorded:
     def last_ns(self) -> int:
         """Time of the last message [ns]; -1 if there is none."""
         return max((int(series.times_ns[-1]) for series in self.series.values()), default=-1)
+
+    def message(self, source: int, channel: Channel, number: int) -> Message | None:
+        """Returns a message, if it was recorded."""
+        series = self.series.get((source, channel))
+        if series is not None:
+            row = int(np.searchsorted(series.sequences, number))
+            if row < len(series.sequences) and series.sequences[row] == number:
+                return Message(channel, source, number, int(series.times_ns[row]), series.values[row])
+        if (time_ns := self.nulls.get((source, channel), {}).get(number)) is not None:
+            return Message(channel, source, number, time_ns, NULL)
+        return None
+
+    def heard_until_ns(self, member: int) -> int:
+        """Returns the instant before which all is known that a member heard [ns]; on a wall clock when it arrived, too.
+
+        It is the instant of `whole_until_ns`, or an earlier one."""
+        until_ns, arrivals = self.whole_until_ns(), self.arrivals
+        if arrivals is None:
+            return until_ns
+        until_ns = min(until_ns, arrivals.known_until_ns(member))
+        for number, one in arrivals.links.items():
+            link = self.plan.links[number]
+            if link.receiver == member:
+                missing = ~np.isin(one.numbers, self._numbers((link.source, link.channel)))
+                until_ns = min(until_ns, int(one.counted_ns[missing].min(initial=until_ns)))
+        return until_ns
 
     def whole_until_ns(self) -> int:
         """Returns the instant before which nothing is missing [ns]: one after the duration if the recording is whole.
@@ -79,12 +108,15 @@ class Recorded:
 
     def _first_missing(self, key: tuple[int, Channel]) -> int:
         """Returns the first number of a message that was not recorded."""
-        series = self.series.get(key)
-        numbers = np.array(sorted(self.nulls.get(key, ())), np.int64)
-        if series is not None:
-            numbers = np.union1d(numbers, series.sequences)
+        numbers = self._numbers(key)
         missing = np.flatnonzero(numbers != np.arange(len(numbers)))
         return int(missing[0]) if len(missing) else len(numbers)
+
+    def _numbers(self, key: tuple[int, Channel]) -> NDArray[np.int64]:
+        """Returns the numbers of the messages that were recorded, ascending."""
+        series = self.series.get(key)
+        numbers = np.array(sorted(self.nulls.get(key, ())), np.int64)
+        return numbers if series is None else np.union1d(numbers, series.sequences)
 
 
 def last_instant_ns(plan: Plan, until_ns: int) -> int:

@@ -1,12 +1,13 @@
-"""Records written as JSON and read back, and the JSON schema of summary.json."""
+"""Records written as JSON and read back, and the JSON schemas of summary.json and of what `echelon analyse` prints."""
 
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from math import isfinite
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from echelon.docstrings import field_docstrings
@@ -52,15 +53,35 @@ def read_summary(path: Path) -> Summary:
 
 def summary_schema() -> dict[str, Any]:
     """Returns the JSON schema of summary.json; descriptions are the docstrings of the records and their fields."""
-    schema: dict[str, Any] = _adapter().json_schema(mode="serialization")
-    schema = {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "summary.json of an echelon run",
-    } | schema
-    records = {record.__name__: record for record in _records()}
-    for name, table in [*schema.get("$defs", {}).items(), ("Summary", schema)]:
-        if name in records:
-            _describe(table, records[name])
+    from echelon.bridge import reports
+    from echelon.sim.results import records, verdict
+
+    return _schema(_adapter(), Summary, "summary.json of an echelon run", (records, verdict, reports))
+
+
+def analysis_schema() -> dict[str, Any]:
+    """Returns the JSON schema of what `echelon analyse --json` prints."""
+    from pydantic import TypeAdapter
+
+    from echelon.sim.results import analysis
+
+    record = analysis.AnalysisResult
+    return _schema(TypeAdapter(record), record, "what echelon analyse --json prints", (analysis,))
+
+
+def _schema(adapter: Any, record: type, title: str, modules: Sequence[ModuleType]) -> dict[str, Any]:
+    """Returns the JSON schema of a record; those of its parts are in some modules."""
+    schema: dict[str, Any] = adapter.json_schema(mode="serialization")
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title} | schema
+    known = {
+        value.__name__: value
+        for module in modules
+        for value in vars(module).values()
+        if isinstance(value, type) and is_dataclass(value)
+    }
+    for name, table in [*schema.get("$defs", {}).items(), (record.__name__, schema)]:
+        if name in known:
+            _describe(table, known[name])
     return schema
 
 
@@ -69,13 +90,6 @@ def _adapter() -> Any:
     from pydantic import TypeAdapter
 
     return TypeAdapter(Summary)
-
-
-def _records() -> list[type]:
-    from echelon.bridge import reports
-    from echelon.sim.results import records, verdict
-
-    return [value for module in (records, verdict, reports) for value in vars(module).values() if is_dataclass(value)]  # type: ignore[misc]
 
 
 def _describe(table: dict[str, Any], record: type) -> None:

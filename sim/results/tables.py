@@ -41,6 +41,8 @@ UNITS: Final[Mapping[str, str]] = MappingProxyType({
     "sent": "messages", "delivered": "messages", "lost": "messages", "in_flight": "messages",
     "duplicates": "messages", "used": "uses", "held": "uses",
     "age_mean": "s", "age_p50": "s", "age_p95": "s", "age_p99": "s", "age_max": "s",
+    "latency": "s", "latency_mean": "s", "latency_p50": "s", "latency_p95": "s", "latency_p99": "s", "latency_max": "s",
+    "jitter": "s",
     "wanted": "N m", "commanded": "N m", "reported": "N m",
 })  # fmt: skip
 """The units of all columns of numbers in all tables"""

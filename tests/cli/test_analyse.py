@@ -2,16 +2,20 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
 
 from echelon.cli.new_scenario import scenario_text, sizes
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import parse
 from echelon.sim.results.block_series import block_series
+from echelon.sim.results.rendering import analysis_schema
 from echelon.sim.results.trace import TraceBuilder
 from support.runs import echelon
+from support.schemas import strict
 
 FOUR = """\
 name = "four"
@@ -45,6 +49,44 @@ def last_errors(text: str, *overrides: str) -> list[float]:
     return [float(part.max()) for part in np.array_split(norms, 4)]
 
 
+def by_name(facts: dict[str, Any]) -> dict[str, Any]:
+    """Returns the rows of the table by their names."""
+    return {row["name"]: row for row in facts["table"]}
+
+
+def test_the_table_has_a_row_for_each_layer_and_channel_and_what_it_assumes() -> None:
+    lines = echelon("analyse", "lab").stdout.splitlines()
+    assert lines[2].startswith("  assumed: robots follow the desired accelerations exactly, no limit acts")
+    at = next(number for number, line in enumerate(lines) if line.split()[:3] == ["layer", "channel", "delay"])
+    rows = [line.split() for line in lines[at + 1 : at + 5]]
+    assert [row[:4] for row in rows] == [
+        ["intra", "state", "352.923", "ms"],
+        ["intra", "command", "352.923", "ms"],
+        ["inter", "group_state", "708.484", "ms"],
+        ["inter", "reference", "708.484", "ms"],
+    ]
+    assert [row[-1] for row in rows] == ["g3", "g3", "inter", "inter"]
+    assert any(line.split()[:2] == ["centroid", "centroid"] and "16.62 s" in line for line in lines)
+
+
+def test_robots_and_groups_are_rows_where_they_are_asked_for() -> None:
+    rows = by_name(json.loads(echelon("analyse", "lab", "--members", "--json").stdout))
+    assert len(rows["g1/r1 state"]["like"]) == 9
+    assert rows["g1, to its members"]["links"] == 6
+    assert rows["g1, to its members"]["delay"]["seconds"] == pytest.approx(0.17646, rel=1e-3)
+
+
+def test_figures_are_files_with_their_command(tmp_path: Path) -> None:
+    done = echelon("analyse", "lab", "--figures", tmp_path, "--format", "svg", "--format", "pdf")
+    names = ["delays", "delays-epsilon", "eigenvalues"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        f"{name}.{kind}" for name in names for kind in ("svg", "pdf")
+    )
+    assert all("echelon analyse lab" in (tmp_path / f"{name}.svg").read_text(encoding="utf-8") for name in names)
+    assert str(tmp_path / "delays.pdf") in done.stdout
+    assert echelon("analyse", "lab", "--format", "pdf").returncode == 2
+
+
 def test_the_first_line_says_of_which_channels_and_periods_it_speaks() -> None:
     first, *rest = echelon("analyse", "multi").stdout.splitlines()
     assert first == (
@@ -58,15 +100,28 @@ def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_millisecon
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["settles"]
-    assert facts["later"]["state"] == {
-        "seconds": pytest.approx(0.0068483, rel=1e-3),
-        "ticks": 6,
-        "tick": pytest.approx(0.001),
-        "ends": "unstable",
-    }
-    assert list(facts["later"]) == list(facts["delays"]) == ["state", "group_state", "reference", "command"]
-    margins = [facts["blocks"][name]["delay_margin"] for name in ("g1", "inter", "centroid")]
+    rows = by_name(facts)
+    assert (
+        rows["intra state"]["delay"]
+        == rows["state"]["delay"]
+        == {
+            "seconds": pytest.approx(0.0068483, rel=1e-3),
+            "ticks": 6,
+            "tick": pytest.approx(0.001),
+            "ends": "unstable",
+            "tried": False,
+            "limits": ["g1", "g2", "g3"],
+        }
+    )
+    assert list(facts["delays"]) == ["state", "group_state", "reference", "command"]
+    assert rows["intra state"]["loss"]["share"] == pytest.approx(0.8335, abs=1e-3)
+    margins = [block["delay_margin"] for block in facts["blocks"] if block["names"][0] in ("g1", "inter", "centroid")]
     assert margins == pytest.approx([0.0071117, 0.071117, 0.71117], rel=1e-4)
+    first = facts["epsilon"][0]
+    assert first["bound_by_norms"] < first["bound"] == pytest.approx(0.02786, rel=1e-3)
+    assert first["bound"] < first["exact"] == pytest.approx(0.31214, rel=1e-4)
+    assert facts["coupling"] == {"exact": pytest.approx(3.3368, rel=1e-4), "sampled": pytest.approx(3.337, rel=1e-3)}
+    assert [one.message for one in Draft202012Validator(strict(analysis_schema())).iter_errors(facts)] == []
 
 
 def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
@@ -78,7 +133,7 @@ def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
         facts = json.loads(done.stdout)
         assert (done.returncode, facts["settles"]) == (0 if settles else 1, settles)
         assert facts["delays"] == {channel: [delay] for channel in ("state", "group_state", "reference", "command")}
-        assert bool(facts["later"]) == settles
+        assert bool(facts["table"]) == settles
         ends = last_errors(
             text,
             rule,
@@ -92,15 +147,15 @@ def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
         assert (ends[-1] < 0.1 * ends[0]) == settles, ends
     lines = echelon("analyse", "-", "--set", "links=[{delay=0.2}]", typed=text).stdout.splitlines()
     assert "state 200 ms, group_state 200 ms, reference 200 ms, command 200 ms" in lines[1]
-    assert "does not settle; errors grow e-fold in" in lines[-1]
-    assert not any("may be later" in line for line in lines)
+    assert "does not settle; errors grow e-fold in" in lines[3]
+    assert not any("later messages may be" in line for line in lines)
 
 
 def test_the_lab_bears_a_tenth_of_a_second_on_every_link() -> None:
     facts = json.loads(echelon("analyse", "lab", "--set", "links=[{delay=0.1}]", "--json").stdout)
     assert facts["settles"]
     assert facts["centroid_age"] == 0  # states are compared with the reference of their own time
-    assert facts["later"]["command"]["seconds"] == pytest.approx(0.15292, rel=1e-3)
+    assert by_name(facts)["command"]["delay"]["seconds"] == pytest.approx(0.15292, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -138,14 +193,16 @@ def test_delays_too_long_to_compute_with_are_refused_at_once() -> None:
 def test_margins_of_matrix_gains_are_those_of_the_worst_direction() -> None:
     gains = 'law.gains=[{block="centroid", k1=[[1.0, 0.0], [0.0, 9.0]], k2=[[1.0, 0.0], [0.0, 3.0]]}]'
     facts = json.loads(echelon("analyse", "lab", "--set", gains, "--json").stdout)
-    assert facts["blocks"]["centroid"]["delay_margin"] == pytest.approx(0.71117 / 3, rel=1e-4)
+    assert facts["blocks"][-1]["names"] == ["centroid"]
+    assert facts["blocks"][-1]["delay_margin"] == pytest.approx(0.71117 / 3, rel=1e-4)
+    assert len(facts["blocks"][-1]["poles"]) == 4
 
 
 def test_a_torque_loop_that_loses_robots_is_said_and_is_exit_code_1() -> None:
     done = echelon("analyse", "paper", "--set", "periods.torque=0.001")
     assert done.returncode == 1
     assert "but periods.torque = 0.001: the torque loop of g3/r9" in done.stdout
-    assert "may be later" not in done.stdout
+    assert "later messages may be" not in done.stdout
 
 
 # Warnings of `validate`

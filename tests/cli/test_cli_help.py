@@ -17,8 +17,16 @@ BIN = Path(sys.executable).parent
 EXAMPLES = sorted(
     {*FIRST_LOOK, *(example for name, entry in ENTRIES.items() for example in entry.command(name).examples)}
 )
-LONG = ("echelon run paper", "echelon run lab", "echelon run drives", "echelon drives", "echelon completion bash")
-"""Beginnings of the examples that take long.  They are not run, nor are those with `vcan0`, which need that interface."""
+LONG = (
+    "echelon run paper",
+    "echelon run lab",
+    "echelon run drives",
+    "echelon drives",
+    "echelon observe",
+    "echelon completion bash",
+)
+"""Beginnings of the examples that take long, or need a run that goes on.  They are not run, nor are those with `vcan0`, which
+need that interface."""
 QUICK = [example for example in EXAMPLES if not example.startswith(LONG) and "vcan0" not in example]
 
 
@@ -30,12 +38,15 @@ def run_in_shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder with two runs and a scenario."""
+    """A user's folder with three runs and a scenario."""
     folder = tmp_path_factory.mktemp("user")
     quick = ("--set", "duration=0.5", "--set", "claims=[]", "--engine", "inprocess", "--quiet")
     for name in ("demo", "avoiding"):
         done = echelon("run", "lab", *quick, "--out", f"runs/{name}", cwd=folder)
         assert done.returncode == 0, done.stderr
+    on_a_wall_clock = ("--clock", "wall", "--can", "none", *quick[:4], "--quiet", "--out", "runs/real")
+    assert echelon("run", "lab", *on_a_wall_clock, cwd=folder).returncode in (0, 1)
+    assert echelon("latencies", "runs/real", cwd=folder).returncode == 0
     assert echelon("new", "my", "--groups", "1x2", cwd=folder).returncode == 0
     (folder / "my.toml").rename(folder / "kept.toml")
     return folder

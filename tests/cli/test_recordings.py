@@ -109,11 +109,83 @@ def test_what_is_whole_of_a_killed_run_is_compared(runs: tuple[Path, Path], tmp_
     assert echelon("replay", folder).returncode == 0
 
 
-def test_a_run_on_a_wall_clock_says_how_exact_it_is(tmp_path: Path) -> None:
-    folder = run(tmp_path / "run", "lab", "--clock", "wall", "--can", "none")
-    done = echelon("replay", folder)
-    assert "on a wall clock: when each message arrived is not recorded" in done.stdout
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on a wall clock; its state links have a delay, too."""
+    links = 'links=[{name="up",channel="state",delay=0.003,policy="hold_then_stop",timeout=0.05}]'
+    events = 'events=[{kind="blackout",at=0.2,duration=0.02,link="up"}]'
+    options = ("--clock", "wall", "--can", "none", "--set", links, "--set", events)
+    return run(tmp_path_factory.mktemp("real") / "run", "lab", *options)
+
+
+def test_a_run_on_a_wall_clock_is_replayed_exactly(real: Path, tmp_path: Path) -> None:
+    done = echelon("replay", real)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    assert done.stdout.splitlines()[-1] == "equal: these roles say what was recorded"
+    facts = json.loads(echelon("replay", real, "--json").stdout)
+    assert sum(channel["equal"] for channel in facts["channels"]) >= 9 * 20
+    changed = json.loads(echelon("replay", real, "--json", "--set", "law.lead=0.25").stdout)
+    assert {channel["member"] for channel in changed["channels"] if channel["first_difference"]} <= {
+        "g1", "g2", "g3", "coordinator",
+    }  # fmt: skip
+    assert not changed["equal"]
+    old = shutil.copytree(real, tmp_path / "old")
+    (old / "arrivals.bin").unlink()
+    done = echelon("replay", old)
     assert (done.returncode, done.stderr) == (1, "")
+    assert "on a wall clock: when each message arrived is not recorded" in done.stdout
+
+
+def test_of_a_wall_clock_the_outputs_are_compared_as_far_as_arrivals_are_known(real: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(real, tmp_path / "cut")
+    data = (folder / "arrivals.bin").read_bytes()
+    (folder / "arrivals.bin").write_bytes(data[: len(data) // 48 * 24])
+    done = echelon("replay", folder)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    assert "not all that roles heard is known: of " in done.stdout
+    assert "and of 12 more not to the end either" in done.stdout
+    damaged = bytearray(data)
+    damaged[len(data) // 48 * 24] ^= 0xFF
+    (folder / "arrivals.bin").write_bytes(damaged)
+    done = echelon("replay", folder)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    assert f"  {folder}/arrivals.bin: is damaged; what stands behind the damage is left out" in done.stdout.splitlines()
+
+
+def test_virtual_time_with_the_latencies_of_a_run_is_that_run(real: Path, tmp_path: Path) -> None:
+    done = echelon("latencies", real)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert lines[0] == f"{real}: one-way latencies of 24 links [ms]"
+    scenario = real / "latencies" / "scenario.toml"
+    assert lines[-1] == f"written: 24 traces, and a scenario with them: echelon run {scenario}"
+    again = run(tmp_path / "again", scenario, "--can", "none", "--engine", "inprocess")
+    done = echelon("diff", real, again)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    assert done.stdout.splitlines()[-1] == "equal: over this time both runs say the same"
+    ideal = run(
+        tmp_path / "ideal", real, "--set", "links=[]", "--set", "events=[]", "--can", "none", "--engine", "inprocess"
+    )
+    assert echelon("diff", real, ideal).returncode == 1
+    facts = json.loads(echelon("latencies", real, "--json", "--out", tmp_path / "traces").stdout)
+    assert len(facts["files"]) == 25
+    assert facts["files"][0] == f"{tmp_path}/traces/scenario.toml"
+    state = next(link for link in facts["links"] if (link["source"], link["receiver"]) == ("g1/r1", "g1"))
+    assert state["latency_p50"] >= 0.003
+    assert state["lost"] >= 2  # in the blackout
+    assert (state["sent"], state["sent"]) == (41, state["delivered"] + state["lost"] + state["in_flight"])
+
+
+def test_files_in_the_way_of_traces_are_not_overwritten(real: Path, tmp_path: Path) -> None:
+    out = tmp_path / "traces"
+    assert echelon("latencies", real, "--out", out).returncode == 0
+    assert echelon("latencies", real, "--out", out).returncode == 0  # the same once more
+    (out / "g1.r1-g1-state.csv").write_text("0.1\n")
+    done = echelon("latencies", real, "--out", out)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"echelon: {out}/g1.r1-g1-state.csv: exists with other content")
+    assert (out / "g1.r1-g1-state.csv").read_text() == "0.1\n"
+    assert echelon("latencies", real, "--out", out, "--replace").returncode == 0
 
 
 @pytest.fixture
@@ -182,6 +254,9 @@ def test_mistakes_are_one_line(runs: tuple[Path, Path], tmp_path: Path) -> None:
         (("replay", folder, "--scenario", "labb"), "echelon: labb: no such file, and no shipped scenario"),
         (("replay", folder, "--tolerance", "x"), "echelon replay: argument --tolerance: 'x' is no number"),
         (("replay", folder, "--tolerance=-1"), "echelon: tolerance -1: must be 0 or more"),
+        (("latencies", "nowhere"), "echelon: nowhere/run.mcap: No such file or directory"),
+        (("latencies", folder), f"echelon: {folder}: a run in virtual time; its latencies are those that its scenario"),
+        (("latencies", bare), f"echelon: {bare}/run.mcap: No such file or directory"),
         (("diff", folder), "echelon diff: the following arguments are required: RUN"),
         (("diff", folder, "nowhere"), "echelon: nowhere: is not the folder of a run"),
         (("diff", folder, damaged), f"echelon: {damaged}/run.mcap: is damaged"),

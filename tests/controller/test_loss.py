@@ -8,11 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from echelon.controller.prediction.linear_run import later
+from echelon.controller.prediction.linear_run import LinearRun, later
 from echelon.controller.prediction.mean_square import gilbert, mean_square
 from echelon.controller.prediction.random_run import RandomRun
 from echelon.controller.prediction.random_steps import Chances, moment
 from echelon.controller.prediction.second_moment import SecondMoment
+from echelon.controller.prediction.spectrum import spectral_radius
+from echelon.controller.prediction.typical_growth import typical_growth
 from echelon.messages import Channel
 from echelon.plan.delay_tables import LOST, DelayTrace
 from echelon.plan.plan import Array, Plan
@@ -101,25 +103,52 @@ def random_plan(tree: Sequence[object], seed: int, **tables: object) -> Plan:
     ((((None,),),), False, 0),
 ])  # fmt: skip
 def test_second_moment_is_the_mean_over_all_patterns_of_loss(tree, timing, broadcast, ticks, monkeypatch):
-    """In one period all that arrives comes or not, in every combination; in the next all is lost.  Before and after all
-    comes."""
     plan = later(random_plan(tree, 3, timing=timing), Channel.STATE, ticks * round(T * 1e9))
-    plan = replace(plan, links=tuple(replace(link, loss_of_message=broadcast) for link in plan.links))
+    check_patterns(
+        replace(plan, links=tuple(replace(link, loss_of_message=broadcast) for link in plan.links)), monkeypatch
+    )
+
+
+@pytest.mark.parametrize(
+    "links",
+    [
+        [{"channel": "state", "policy": "predict"}],
+        [{"policy": "predict"}, {"channel": "reference"}, {"channel": "command"}],
+        [{"channel": "state", "policy": "predict", "delay": 0.2}, {"channel": "command", "delay": 0.1}],
+        [{"channel": "state", "policy": "extrapolate"}],
+        [{"channel": "state", "policy": "extrapolate", "delay": 0.2}],
+        [{"channel": "command", "policy": "zero"}],
+        [
+            {"channel": "command", "policy": "hold_then_stop", "timeout": 0.15},
+            {"channel": "reference", "policy": "zero"},
+        ],
+    ],
+)
+def test_policies_are_those_of_the_mean_over_all_patterns_of_loss(links, monkeypatch):
+    check_patterns(random_plan(((None,), None), 3, timing="time_driven", links=links), monkeypatch)
+
+
+def check_patterns(plan: Plan, patch: pytest.MonkeyPatch) -> None:
+    """Holds the second moment against the mean over all patterns of loss in one period.  In the period after it all is lost;
+    before and after these two all comes."""
     losses = np.random.default_rng(5).uniform(0.2, 0.7, len(plan.links))
     draws: dict[object, int] = {}
     draw = [
-        draws.setdefault((link.source, link.channel) if broadcast else at, at) for at, link in enumerate(plan.links)
+        draws.setdefault((link.source, link.channel) if link.loss_of_message else at, at)
+        for at, link in enumerate(plan.links)
     ]
     losses = losses[draw]
-    hyperperiods = 4 + ticks
+    late = [link.delay_min_ns // link.period_ns for link in plan.links]
+    # With late states, nothing is known in the first periods, and nothing is commanded.
+    random = 1 + 2 * max(late)
+    hyperperiods = random + 3
 
     expected = np.zeros((4 * len(plan.robots),) * 2)
     for came in product((False, True), repeat=len(draws)):
         fate = dict(zip(draws.values(), came, strict=True))
         share = np.prod([1 - losses[at] if fate[at] else losses[at] for at in draws.values()])
-        first = [1 if link.channel is Channel.STATE else 1 + ticks for link in plan.links]
-        rows = [(*(True,) * begin, fate[at], False, *(True,) * 10) for begin, at in zip(first, draw, strict=True)]
-        x = point_run(patterned(plan, rows), hyperperiods, monkeypatch)[hyperperiods]
+        rows = [(*(True,) * (random - k), fate[at], False, *(True,) * 20) for k, at in zip(late, draw, strict=True)]
+        x = point_run(patterned(plan, rows), hyperperiods, patch)[hyperperiods]
         expected += share * np.outer(x, x)
 
     run = RandomRun(plan, range(len(plan.links)))
@@ -127,11 +156,9 @@ def test_second_moment_is_the_mean_over_all_patterns_of_loss(tree, timing, broad
     x = np.zeros(registers.count)
     for number, robot in enumerate(plan.robots):
         x[registers.memory(number)[:2]] = robot.start
-    # With late states, nothing is known in the first ticks, and nothing is commanded.
     X = np.outer(x, x)[None]
-    for tick in range(hyperperiods):
-        now = tick - ticks
-        chances = Chances.of(losses if now == 1 else np.full(len(losses), float(now == 2)))
+    for period in range(hyperperiods):
+        chances = Chances.of(losses if period == random else np.full(len(losses), float(period == random + 1)))
         X = moment(run.steps, X, chances)
     places = np.concatenate([registers.memory(number) for number in range(len(plan.robots))])
     assert X[0][np.ix_(places, places)] == pytest.approx(expected, rel=1e-9, abs=1e-9)
@@ -158,3 +185,20 @@ def test_growth_with_bursts_is_that_of_the_chains_kronecker_map(burst, loss):
         found = SecondMoment(part, chances)
         assert (found.gain() < 1) == (expected < 1)
         assert found.gain(1.001 * expected) < 1 < found.gain(0.999 * expected)
+
+
+def test_typical_runs_decay_where_the_second_moment_grows():
+    """The pair's critical loss in the mean square is 0.530; its typical growth passes zero between 0.6 and 0.7."""
+    for loss, decays in ((0.6, True), (0.7, False)):
+        found = typical_growth(pair(), Channel.STATE, loss)
+        assert (found.rate < 0) == decays
+        assert abs(found.rate) > 3 * found.error
+    boundary = mean_square(pair(), Channel.STATE).loss
+    assert boundary is not None
+    assert boundary < 0.6
+
+
+def test_without_loss_typical_growth_is_that_of_the_map():
+    plan = pair()
+    found = typical_growth(plan, Channel.STATE, 0.0)
+    assert found.rate == pytest.approx(np.log(spectral_radius(LinearRun(plan).map())), abs=2e-3)

@@ -1,6 +1,7 @@
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.delay_tables import ClockPlan
 from echelon.plan.plan import LinkPlan
 from echelon.role import Acts, Input, Stage
+from echelon.runtime.arrivals import RECORD
 from echelon.runtime.mailbox import Mailbox, WallMailbox
 from echelon.runtime.turns import Turn
 from support.links import PunctualLink
@@ -40,7 +42,7 @@ def mailbox_of(
     seed: int = 1,
     stages: Sequence[Stage] | None = None,
     *,
-    kind: type[Any] = Mailbox,
+    kind: Callable[..., Any] = Mailbox,
     acts: Acts = Acts.IN_TURN,
     duration_ns: int = NEVER_NS,
 ) -> Any:
@@ -160,6 +162,75 @@ def test_a_late_message_is_used_while_a_newer_one_is_missing():
     (heard,) = mailbox.take(0, 2 * PERIOD)
     assert heard is not None
     assert heard.sequence == 1
+
+
+def wall_acts(mailbox: WallMailbox, time_ns: int) -> list[tuple[int, list[int | None]]]:
+    """Returns when the only stage acts that is due at `time_ns`, and the numbers of the messages that it uses, once all that
+    comes in its period has come."""
+    return [
+        (at_ns - time_ns, [None if message is None else message.sequence for message in heard])
+        for at_ns, heard in mailbox.acts_with_all(0, time_ns, time_ns + PERIOD - 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("acts", "expected"),
+    [
+        (Acts.WHEN_HEARD, [(6, [0, 0])]),
+        (Acts.ON_ARRIVAL, [(0, [None, None]), (2, [0, None]), (6, [0, 0])]),
+        (Acts.AT_INSTANT, [(0, [None, None])]),
+        (Acts.IN_TURN, [(0, [0, 0])]),  # it waits for both, and its instant stays
+    ],
+)
+def test_on_a_wall_clock_a_stage_acts_in_the_instant_of_arrival(acts, expected):
+    links = [LinkPlan(source, RECEIVER, Channel.STATE, PERIOD) for source in range(2)]
+    mailbox = mailbox_of(links, kind=WallMailbox, acts=acts)
+    mailbox.receive(message_of(links[0], 0), 2)
+    mailbox.receive(message_of(links[1], 0), 6)
+    assert wall_acts(mailbox, 0) == expected
+
+
+def test_a_late_act_uses_what_has_come_and_was_sent_by_its_instant():
+    """The process gets to the act of the first period, which ends at 9, after messages 0 to 2 have come.  They were sent at 0,
+    10 and 20."""
+    link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD)
+    mailbox = mailbox_of([link], kind=partial(WallMailbox, noted=True), acts=Acts.WHEN_HEARD)
+    ready_ns, missed = mailbox.ready(0, 0, PERIOD)
+    assert (ready_ns, missed) == (PERIOD - 1, True)
+    for number, came_ns in enumerate((25, 26, 27)):
+        mailbox.receive(message_of(link, number), came_ns)
+    mailbox.hasten(0, ready_ns)
+    (heard,) = mailbox.hear(0, ready_ns)
+    assert heard is not None
+    assert heard.sequence == 0
+    mailbox.hasten(0, 2 * PERIOD - 1)
+    assert wall_acts(mailbox, PERIOD) == [(PERIOD - 1, [1])]
+    assert list(RECORD.iter_unpack(mailbox.arrivals)) == [
+        (0, 0, 0, 25), (0, 1, 10, 26), (0, 2, 20, 27), (0, 0, 0, 9), (0, 1, 10, 19),
+    ]  # fmt: skip
+
+
+def test_the_delay_of_a_link_is_not_hastened():
+    link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD, 30, 30)
+    mailbox = mailbox_of([link], kind=partial(WallMailbox, noted=True), acts=Acts.WHEN_HEARD)
+    mailbox.receive(message_of(link, 0), 5)
+    mailbox.receive(message_of(link, 1), 70)
+    for instant, arrives in ((29, [30, 70]), (35, [30, 70]), (45, [30, 70, 45])):
+        mailbox.hasten(0, instant)
+        assert [arrived for *_, arrived in RECORD.iter_unpack(mailbox.arrivals)] == arrives
+
+
+def test_arrivals_are_noted_once_and_only_of_messages_that_are_not_lost():
+    links = [LinkPlan(0, RECEIVER, Channel.STATE, PERIOD, loss=1.0), LinkPlan(1, RECEIVER, Channel.STATE, PERIOD)]
+    mailbox = mailbox_of(links, kind=partial(WallMailbox, noted=True))
+    for link in links:
+        for time_ns in (3, 4):
+            mailbox.receive(message_of(link, 0), time_ns)
+    mailbox.receive(Message(Channel.COMMAND, 0, 0, 0, np.ones(1)), 5)
+    assert list(RECORD.iter_unpack(mailbox.arrivals)) == [(1, 0, 0, 3)]
+    silent = mailbox_of(links, kind=WallMailbox)
+    silent.receive(message_of(links[1], 0), 3)
+    assert silent.arrivals is None
 
 
 def test_a_message_from_the_future_waits_for_its_instant():

@@ -9,7 +9,7 @@ import pytest
 
 import echelon.sim.engines.in_process
 from echelon.controller.trajectory import Line
-from echelon.messages import STATE_FIELDS, Channel, Heard, Message
+from echelon.messages import STATE_FIELDS, Channel, Heard, Message, field_index
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.plan import Array, Plan
 from echelon.plugins import Part
@@ -17,6 +17,8 @@ from echelon.role import Acts, Input, Stage
 from echelon.runtime.turns import Turn
 from echelon.sim.engines.in_process import Engine
 from support.growth import growth
+
+_ACCELERATION = field_index(STATE_FIELDS, "ax", "ay")
 
 
 class PointRobot:
@@ -44,6 +46,7 @@ class PointRobot:
         self._move(time_ns)
         values = np.zeros(len(STATE_FIELDS))
         values[:4] = self.said = (*self.p, *self.v)
+        values[_ACCELERATION] = self.a
         return (Message(Channel.STATE, self.index, time_ns // self._plan.period_ns, time_ns, values),)
 
     def _obey(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:

@@ -22,8 +22,9 @@ HEAD = """\
 # Public names
 
 What others may rely on, made from the code by `make docs`. A test fails when one of these names changes unnoticed. The keys of
-a scenario are in [scenario.md](scenario.md), those of `summary.json` in [summary.schema.json](summary.schema.json); both are
-made and tested in the same way. What is in neither of these pages is internal and may change.
+a scenario are in [scenario.md](scenario.md), those of `summary.json` in [summary.schema.json](summary.schema.json), those
+of `echelon analyse --json` in [analysis.schema.json](analysis.schema.json); all are made and tested in the same way. What is in
+none of these pages is internal and may change.
 """
 
 

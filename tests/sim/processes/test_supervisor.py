@@ -4,6 +4,7 @@ import os
 import re
 import resource
 import signal
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing import Process
@@ -13,15 +14,20 @@ from subprocess import Popen
 import numpy as np
 import pytest
 
-from echelon.messages import Channel
+from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan.plan import Plan
+from echelon.runtime.session import Session
+from echelon.runtime.wire import data_key, encode, join, watch_key
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import parse
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.failures import NAMED, few
 from echelon.sim.processes.outcome import Outcome, Progress
 from echelon.sim.processes.supervisor import Supervisor
+from echelon.sim.recording.arrivals import read_arrivals
 from echelon.sim.recording.mcap_reader import read_trace, recover
+from echelon.sim.results.trace import Trace
+from support.arrivals import with_traces
 from support.runs import (
     descendants,
     kill_session,
@@ -180,6 +186,63 @@ def test_two_runs_at_once_never_meet(tmp_path: Path) -> None:
     assert digests[0] != digests[1]
 
 
+class Attacker:
+    """A program without the run's secrets that connects to each process that listens, in threads of its own.  It hears what it
+    can, and forges states of a robot a few periods ahead."""
+
+    def __init__(self, supervisor: Supervisor, plan: Plan) -> None:
+        specs = supervisor._specs
+        self._run, self._plan = specs[0].run, plan
+        self._connect = [endpoint for spec in specs for endpoint in spec.listen]
+        self.heard: list[bytes] = []
+        self.forged = 0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._attack)
+
+    def __enter__(self) -> "Attacker":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _attack(self) -> None:
+        robot, run = self._plan.robots[0], self._run
+        state = np.full(len(STATE_FIELDS), 3.0)
+        with (
+            Session(listen=[], connect=self._connect, lockstep=False) as ear,
+            Session(listen=[], connect=self._connect, lockstep=False) as mouth,
+        ):
+            ear.subscribe([f"echelon/{run}/**", f"echelon/{run}/@watch/**"], self.heard.append)
+            said = mouth.publisher(data_key(run, robot.path, Channel.STATE))
+            copied = mouth.publisher(watch_key(run, "robot", robot.name))
+            while not self._done.wait(0.001):
+                number = self.forged % (self._plan.duration_ns // robot.period_ns)
+                payload = encode(Message(Channel.STATE, robot.index, number, number * robot.period_ns, state))
+                said.put(payload)
+                copied.put(join([payload]))
+                self.forged += 1
+
+
+@pytest.mark.parametrize("virtual", [True, False])
+def test_a_program_without_the_secrets_of_a_run_hears_and_changes_nothing(tmp_path: Path, virtual: bool) -> None:
+    plan = plan_of("lab", "duration=2.0")
+    supervisor = Supervisor(plan, tmp_path, run=f"attacked-{os.getpid()}", virtual=virtual)
+    with Attacker(supervisor, plan) as attacker:
+        outcome = supervisor.run()
+    assert outcome.failure is None
+    assert attacker.forged > 100
+    assert not attacker.heard
+    if virtual:
+        assert outcome.trace.digest() == trace_of(plan).digest()
+    else:
+        assert np.abs(outcome.trace.common()[1][..., 0] - 3.0).min() > 0
+    refused = [done.runner.refused for done in outcome.processes if done.runner is not None]
+    assert refused
+    assert not any(refused)
+
+
 A_PERIOD_LATE = 'links=[{source="**", receiver="**", delay=0.05}]'
 
 
@@ -198,6 +261,66 @@ def test_on_a_wall_clock_each_act_is_at_most_a_period_late_when_nothing_is_late(
             for trace in (trace_of(slowest), outcome.trace)
         )
         assert 0 < difference < bound
+
+
+def equal_states(recorded: Trace, other: Trace) -> tuple[int, int]:
+    """Returns how many states of robots were recorded, and how many of them are the same in another trace, bit for bit."""
+    same = 0
+    for robot, times_ns in enumerate(recorded.times_ns):
+        at = np.searchsorted(other.times_ns[robot], times_ns)
+        assert (other.times_ns[robot][at] == times_ns).all()
+        same += int((other.states[robot][at] == recorded.states[robot]).all(axis=1).sum())
+    return sum(map(len, recorded.times_ns)), same
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        (LINKS, "periods.acceleration=0.002", "periods.torque=0.001"),
+        ('timing="time_driven"',),
+        ('links=[{channel="state",delay={min=0.0,max=0.03},loss=0.1,policy="hold_then_stop",timeout=0.04}]',),
+    ],
+    ids=["ideal links", "short periods", "time-driven", "delay and loss"],
+)
+@pytest.mark.parametrize("busy", [False, True], ids=["", "busy"])
+def test_virtual_time_with_the_latencies_of_a_wall_clock_is_that_run(
+    overrides: tuple[str, ...], busy: bool, tmp_path: Path
+) -> None:
+    """However late messages and processes were: the states are those of the run, bit for bit."""
+    plan = plan_of("lab", "duration=0.7", *overrides)
+    others = [Process(target=_spin, daemon=True) for _ in range(2 * busy)]
+    for other in others:
+        other.start()
+    try:
+        outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
+    finally:
+        for other in others:
+            other.kill()
+    assert outcome.failure is None
+    arrivals = read_arrivals(tmp_path / "arrivals.bin", plan)
+    assert not arrivals.damaged
+    assert sorted(arrivals.ends_ns) == [one.index for one in plan.formation]
+    recorded, same = equal_states(outcome.trace, trace_of(with_traces(plan, arrivals)))
+    assert recorded == same > 300
+    assert equal_states(outcome.trace, trace_of(plan))[1] < same  # without these latencies it is another run
+
+
+def test_the_arrivals_at_a_member_that_is_killed_are_kept(tmp_path: Path) -> None:
+    plan, killed = plan_of("lab", "duration=100.0"), list[int]()
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns > 700_000_000 and not killed:
+            killed.append(pid_of("g2/r5", descendants(os.getpid())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    outcome = Supervisor(plan, tmp_path, run="wall", virtual=False, show=watch).run()
+    assert outcome.failure is not None
+    assert "lost robot g2/r5" in outcome.failure
+    arrivals = read_arrivals(tmp_path / "arrivals.bin", plan)
+    index = next(robot.index for robot in plan.robots if robot.name == "g2/r5")
+    assert sorted({*range(13)} - set(arrivals.ends_ns)) == [index]
+    assert 0 < arrivals.known_until_ns(index) < plan.duration_ns
 
 
 def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) -> None:

@@ -6,10 +6,12 @@ import pytest
 
 from echelon.errors import UsageError
 from echelon.messages import NULL, Channel, Message
+from echelon.plan.can_plan import NEVER_NS
 from echelon.sim.recorded_runs import open_recorded, replay_run
 from echelon.sim.replay.comparison import ChannelComparison
 from echelon.sim.replay.replay import Replay
-from support.recordings import LOSSY, QUICK, messages_of, planted, record
+from support.arrivals import write_arrivals
+from support.recordings import LOSSY, QUICK, Alter, messages_of, planted, record
 from support.runs import plan_of
 
 LEADER, ROOT = 9, 12
@@ -261,3 +263,60 @@ def test_a_recording_by_another_version_is_told(tmp_path: Path) -> None:
     text = str(replayed(record(tmp_path / "run", "lab", metadata=metadata)))
     assert "recorded with echelon 0.0.1, now 0.1.0; numpy 1.0, now" in text
     assert "last digits may differ, which --tolerance allows for" in text
+
+
+WALL = {"engine": "processes", "clock": "wall"}
+
+
+def on_a_wall_clock(
+    folder: Path, *overrides: str, alter: Alter = lambda message: message, ended: bool = True, until_ns: int = NEVER_NS
+) -> Path:
+    """Records a run over ideal links as if it had been on a wall clock where messages took no time; the arrivals are known up
+    to an instant."""
+    record(folder, "lab", *overrides, alter=alter, metadata=WALL)
+    plan = plan_of("lab", *QUICK, *overrides)
+    rows = [
+        (number, message.sequence, message.time_ns, message.time_ns)
+        for message in messages_of(plan)
+        for number, link in enumerate(plan.links)
+        if (link.source, link.channel) == (message.source, message.channel) and message.time_ns < until_ns
+    ]
+    write_arrivals(folder, rows, [(one.index, plan.duration_ns + 1) for one in plan.formation] if ended else ())
+    return folder
+
+
+def test_on_a_wall_clock_arrivals_decide_what_was_heard(tmp_path: Path) -> None:
+    found = replayed(on_a_wall_clock(tmp_path / "run"))
+    assert found.equal
+    assert sum(channel.equal for channel in found.channels) == 16 * 41
+    assert not any("wall clock" in remark or "not all" in remark for remark in found.remarks)
+    assert replayed(tmp_path / "run", "links=[{delay=0.2,loss=0.9}]").equal  # whatever the links say now
+    (tmp_path / "run" / "arrivals.bin").write_bytes(b"")
+    assert all(channel.compared == 0 for channel in replayed(tmp_path / "run").channels)
+
+
+def test_on_a_wall_clock_a_role_is_compared_up_to_what_the_recorder_missed(tmp_path: Path) -> None:
+    """The command number 7 of g1 is missing, so what its robots did from 0.07 s on is not known; all else is."""
+
+    def missed(message: Message) -> Message | None:
+        return None if message[1:3] == (LEADER, 7) and message.channel is Channel.COMMAND else message
+
+    found = replayed(on_a_wall_clock(tmp_path / "run", alter=missed))
+    assert found.equal
+    assert [channel_of(found, name, Channel.STATE).compared for name in ("g1/r1", "g2/r4")] == [7, 41]
+    assert channel_of(found, "g1", Channel.COMMAND).only_second == 1
+    (says,) = [remark for remark in found.remarks if remark.startswith("not all that roles heard is known: ")]
+    assert says.endswith("of g1/r1 outputs are compared up to t = 0.07 s, and of 2 more not to the end either")
+
+
+def test_on_a_wall_clock_a_member_that_was_killed_is_compared_up_to_its_last_arrival(tmp_path: Path) -> None:
+    found = replayed(on_a_wall_clock(tmp_path / "run", ended=False, until_ns=200_000_000))
+    assert found.equal
+    assert {channel.compared for channel in found.channels} == {19}
+
+
+def test_of_a_wall_clock_a_changed_value_is_found(tmp_path: Path) -> None:
+    found = replayed(on_a_wall_clock(tmp_path / "run", alter=planted(LEADER, Channel.COMMAND, 7, 3, 0.25)))
+    assert found.first_difference is not None
+    assert (found.first_difference.time, found.first_difference.member) == (0.07, "g1")
+    assert {channel.member for channel in found.channels if not channel.is_equal} == {"g1", "g1/r2"}

@@ -2,24 +2,27 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
 
-from echelon.sim.results.rendering import json_text, read_summary, summary_schema, to_json
+from echelon.sim.results.rendering import analysis_schema, json_text, read_summary, summary_schema, to_json
 from support.runs import ROOT, echelon, summary_of
+from support.schemas import strict
 
 PUBLISHED = ROOT / "docs" / "summary.schema.json"
 
 
 def test_what_is_published_is_up_to_date() -> None:
     assert json.loads(PUBLISHED.read_text(encoding="utf-8")) == summary_schema(), "make docs"
+    analyses = PUBLISHED.with_name("analysis.schema.json")
+    assert json.loads(analyses.read_text(encoding="utf-8")) == analysis_schema(), "make docs"
 
 
 def test_every_record_and_every_key_is_described() -> None:
-    schema = summary_schema()
-    for name, table in {**schema["$defs"], "Summary": schema}.items():
+    summaries, analyses = summary_schema(), analysis_schema()
+    tables = {**summaries["$defs"], "Summary": summaries, **analyses["$defs"], "AnalysisResult": analyses}
+    for name, table in tables.items():
         assert table["description"], name
         assert table["properties"], name
         assert not [key for key, value in table["properties"].items() if not value.get("description")], name
@@ -43,11 +46,3 @@ def test_real_summaries_fit_the_schema_and_read_back(tmp_path: Path, arguments: 
     record = read_summary(tmp_path / "summary.json")
     assert to_json(record) == summary
     assert json_text(record) + "\n" == (tmp_path / "summary.json").read_text(encoding="utf-8")
-
-
-def strict(schema: Any) -> Any:
-    """Returns a schema that allows no key it does not name."""
-    if isinstance(schema, dict):
-        more = {"additionalProperties": False} if "properties" in schema else {}
-        return {key: strict(value) for key, value in schema.items()} | more
-    return [strict(item) for item in schema] if isinstance(schema, list) else schema

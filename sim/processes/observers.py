@@ -1,0 +1,47 @@
+"""The process `observers`: it receives copies of all messages of a run and gives them on to those who may only read."""
+
+from multiprocessing.connection import Connection
+
+from echelon.messages import Channel, Message
+from echelon.runtime.session import Receive, Session
+from echelon.runtime.wire import data_key, encode, watch_key
+from echelon.sim.observing import gate_token
+from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
+from echelon.sim.processes.watchers import HIGH_WATER, PROGRESS_S, Reception
+from echelon.sim.recording.time_order import speakers
+
+
+def run_observers(spec: ProcessSpec, session: Session, control: Connection) -> None:
+    """Gives on all messages but frames, which can be heard on the buses, each under the key of its member and channel.
+
+    They go through a session of their own, which drops what an observer does not take."""
+    plan, gate = spec.plan, spec.gate
+    assert gate is not None
+    reception = Reception(
+        session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER),
+        speakers(plan, spec.virtual, bool(spec.can_urls)),
+        plan,
+    )
+    paths = {one.index: one.path for one in plan.all_roles}
+    puts: dict[tuple[int, Channel], Receive] = {}
+    try:
+        outside = Session(listen=[gate.endpoint], connect=[], lockstep=False, credentials=gate.credentials)
+    except ValueError as error:
+        raise StartError(str(error)) from None
+
+    def give(messages: list[Message]) -> None:
+        for message in messages:
+            if message.channel is not Channel.FRAMES:
+                at = message.source, message.channel
+                if at not in puts:
+                    puts[at] = outside.publisher(data_key(spec.run, paths[message.source], message.channel)).put
+                puts[at](encode(message))
+
+    with outside:
+        outside.declare_token(gate_token(spec.run))
+        meet(spec, session, control)
+        while (order := hear_finish(control)) is None:
+            give(reception.take(PROGRESS_S / 2))
+        for messages in reception.drain(order.messages):
+            give(messages)
+        finish(spec, control)  # before closing, which waits for observers that stand still

@@ -1,0 +1,146 @@
+"""A run that is open to observers: they read all of it, never write, and never hold it up."""
+
+import json
+import os
+import stat
+import sys
+from dataclasses import replace
+from pathlib import Path
+from subprocess import PIPE, Popen
+
+import numpy as np
+import pytest
+
+from echelon.errors import UsageError
+from echelon.messages import Channel, Message
+from echelon.runtime.credentials import Credentials, Identity, new_identity
+from echelon.runtime.session import Session
+from echelon.runtime.wire import data_key, encode, join, run_keys, watch_key
+from echelon.sim.observing import TICKET, Ticket, new_gate, observe
+from echelon.sim.processes.supervisor import Supervisor
+from support.runs import echelon, plan_of, start_echelon, summary_of, trace_of, until
+
+QUICK = ("--can", "none", "--no-report", "--quiet")
+WALL = ("--clock", "wall", "--observe", *QUICK)
+
+
+def opened(folder: Path) -> bool:
+    """Returns whether a run has written its ticket."""
+    return until(lambda: (folder / TICKET).exists())
+
+
+def test_an_observer_reads_a_run_until_it_ends(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = start_echelon("run", "lab", "--set", "duration=4.0", *WALL, "--out", folder)
+    assert opened(folder)
+    assert stat.S_IMODE((folder / TICKET).stat().st_mode) == 0o600
+    done = echelon("observe", folder, "--under", "g2", "--channel", "state", "--json")
+    command.communicate()
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 0, done.stderr
+    assert {line["from"] for line in lines} == {"g2/r4", "g2/r5", "g2/r6"}
+    assert {line["channel"] for line in lines} == {"state"}
+    assert lines[-1]["t"] > 3.9
+    assert all(abs(line["values"]["x"]) < 10 for line in lines)
+    again = echelon("observe", folder)
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "does not answer" in again.stderr
+
+
+FROZEN = """
+import os, signal, sys
+from pathlib import Path
+from echelon.sim.observing import Ticket, observe
+for message in observe(Ticket.read(Path(sys.argv[1]))):
+    print(message.time_ns, flush=True)
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
+
+def test_a_run_ends_well_though_an_observer_stands_still(tmp_path: Path) -> None:
+    """That a session on a wall clock never waits for a receiver is tested in tests/runtime/test_session.py."""
+    plan = plan_of("lab", "duration=15.0")
+    supervisor = Supervisor(plan, tmp_path, run=f"observed-{os.getpid()}", virtual=True, observe=True)
+    assert supervisor.ticket is not None
+    supervisor.ticket.write(tmp_path)
+    with Popen([sys.executable, "-c", FROZEN, str(tmp_path)], stdout=PIPE, text=True) as frozen:
+        try:
+            outcome = supervisor.run()
+            assert frozen.stdout is not None
+            assert frozen.stdout.readline()  # it heard the run before it stood still
+            assert frozen.poll() is None
+        finally:
+            frozen.kill()
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def test_a_ticket_is_of_no_use_for_writing(tmp_path: Path) -> None:
+    """Neither at the process `observers` nor at any other."""
+    plan = plan_of("lab", "duration=5.0")
+    supervisor = Supervisor(plan, tmp_path, run=f"observed-{os.getpid()}", virtual=True, observe=True)
+    ticket = supervisor.ticket
+    assert ticket is not None
+    endpoints = [endpoint for spec in supervisor._specs for endpoint in spec.listen]
+    guest = Identity(ticket.user, new_identity("x", ()).zenoh_id, ticket.password, ())
+    robot, run = plan.robots[0], ticket.run
+    with Session(
+        listen=[],
+        connect=[ticket.endpoint, *endpoints],
+        lockstep=False,
+        credentials=Credentials(guest, run_keys(run)),
+    ) as session:
+        forged = Message(Channel.STATE, robot.index, 3, 3 * robot.period_ns, np.full(16, 3.0))
+        puts = (
+            session.publisher(data_key(run, robot.path, Channel.STATE)),
+            session.publisher(watch_key(run, "robot", robot.name)),
+        )
+        said = 0
+
+        def say(*_: object) -> None:
+            nonlocal said
+            puts[0].put(encode(forged))
+            puts[1].put(join([encode(forged)]))
+            said += 1
+
+        supervisor._show = say
+        outcome = supervisor.run()
+    assert said > 3
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+def test_what_observers_hear_is_what_was_recorded(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = start_echelon("run", "lab", "--set", "duration=2.0", *WALL, "--out", folder)
+    assert opened(folder)
+    heard = list(observe(Ticket.read(folder), "g1/r1"))
+    command.communicate()
+    from echelon.sim.notebook import open_run
+
+    recorded = open_run(folder).robots["g1/r1"]
+    times = [message.time_ns / 1e9 for message in heard]
+    assert len(times) > 10
+    rows = np.searchsorted(recorded["t"], times)
+    assert np.array_equal([message.values[0] for message in heard], recorded["x"][rows])
+    assert summary_of(folder)["run"]["failure"] is None
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [(None, "holds no observe.json"), ("{", "cannot be read"), ('{"run": "x"}', "cannot be read")],
+)
+def test_tickets_that_cannot_be_used_are_said_to_be(tmp_path: Path, content: str | None, why: str) -> None:
+    if content is not None:
+        (tmp_path / TICKET).write_text(content)
+    with pytest.raises(UsageError, match=why):
+        Ticket.read(tmp_path)
+    replace(new_gate("x").ticket, schema_version=0).write(tmp_path)
+    with pytest.raises(UsageError, match="speaks schema version 0"):
+        Ticket.read(tmp_path)
+
+
+def test_a_run_in_one_process_cannot_be_observed(tmp_path: Path) -> None:
+    done = echelon("run", "lab", "--observe", "--engine", "inprocess", "--out", tmp_path / "run")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--observe: needs --engine processes" in done.stderr

@@ -45,10 +45,11 @@ studies: $(VENV)/.run ## the shipped studies into runs/studies, and the README's
 	$(BIN)/echelon study all --out runs/studies --format svg
 	cp runs/studies/epsilon/figures/delay/tolerated.svg docs/delays.svg
 
-docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, and public-names.md, from their source
+docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, public-names.md and the columns in sweep.md, from their source
 	$(BIN)/echelon schema scenario --markdown > docs/.new && mv docs/.new docs/scenario.md
 	$(BIN)/echelon schema summary > docs/.new && mv docs/.new docs/summary.schema.json
 	$(BIN)/echelon schema analysis > docs/.new && mv docs/.new docs/analysis.schema.json
+	PYTHONPATH=tests $(BIN)/python -m support.sweep_page > docs/.new && mv docs/.new docs/sweep.md
 	PYTHONPATH=tests $(BIN)/python -m support.public_names > docs/.new && mv docs/.new docs/public-names.md
 
 test: $(VENV)/.dev ## all tests

@@ -101,13 +101,13 @@ def sweep(options: SweepOptions) -> int:
 
     def show(now: int, of: int, before: int) -> None:
         nonlocal done, total
+        if not total and not options.quiet:
+            print(_heading(prepared, out), file=sys.stderr, flush=True)
         done, total = now, of
         display.show(now, of, before)
 
     try:
         with SweepDisplay(_notes(prepared), quiet=options.quiet) as display:
-            if not options.quiet:
-                print(_heading(prepared, out), file=sys.stderr, flush=True)
             made = run(prepared, out, workers, show)
     except KeyboardInterrupt:
         print(

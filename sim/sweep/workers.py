@@ -178,13 +178,13 @@ class DaskWorkers:
 
     def __init__(self, address: str) -> None:
         try:
-            import distributed
+            self._dask = _distributed()
         except ImportError:
             raise UsageError(
                 f"--workers {address}: needs dask.distributed, which is not installed: pip install 'echelon[dask]'"
             ) from None
         try:
-            self._client: Any = distributed.Client(address, timeout=10)
+            self._client = self._dask.Client(address, timeout=10)
         except (OSError, ValueError, TimeoutError) as error:
             why = str(error).partition("\n")[0]
             raise UsageError(f"--workers {address}: no dask scheduler answers there: {why}") from None
@@ -195,10 +195,8 @@ class DaskWorkers:
 
     def perform(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Rows]]:
         """Yields each task with its rows when it is done.  Raises WorkersLostError."""
-        import distributed
-
         waiting, running = iter(tasks), dict[Any, Task]()
-        completed = distributed.as_completed()
+        completed = self._dask.as_completed()
         window = AHEAD * max(1, sum(self._client.nthreads().values()))
         while True:
             while len(running) < window and (task := next(waiting, None)) is not None:
@@ -211,13 +209,20 @@ class DaskWorkers:
             task = running.pop(future)
             try:
                 rows = future.result()
-            except distributed.KilledWorker:
+            except self._dask.KilledWorker:
                 raise WorkersLostError(f"workers died again and again at {task.name}") from None
             yield task, rows
 
     def close(self) -> None:
         """Drops what still goes on, and leaves the cluster."""
         self._client.close()
+
+
+def _distributed() -> Any:
+    """Returns the module, which has no types.  Raises ImportError."""
+    import distributed
+
+    return distributed
 
 
 def _version() -> str:

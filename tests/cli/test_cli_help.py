@@ -24,6 +24,7 @@ LONG = (
     "echelon drives",
     "echelon observe",
     "echelon completion bash",
+    "echelon sweep lab --set duration=30",
 )
 """Beginnings of the examples that take long, or need a run that goes on.  They are not run, nor are those with `vcan0`, which
 need that interface."""

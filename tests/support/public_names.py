@@ -16,6 +16,7 @@ from echelon.plugins import Plugin
 from echelon.sim.out_folder import run_files
 from echelon.sim.parts.loading import REGISTRY
 from echelon.sim.results.records import Summary
+from echelon.sim.sweep.folder import FILES as SWEEP_FILES
 from support.runs import ROOT, plan_of
 
 HEAD = """\
@@ -37,6 +38,7 @@ def page() -> str:
         "Commands": _commands(),
         "Exit codes": _exit_codes(),
         "Files of a run": (f"- `{name}`" for name in run_files(plan_of("lab"), bus=True)),
+        "Files of a sweep": (f"- `{name}`" for name in SWEEP_FILES),
         "Channels of messages": (f"- `{channel.name}` = {channel.value}" for channel in Channel),
     }
     return HEAD + "".join(f"\n## {title}\n\n" + "\n".join(lines) + "\n" for title, lines in sections.items())

@@ -42,7 +42,9 @@ CASES: dict[str, tuple[tuple[str, ...], str, str]] = {
         ("lab", "duration=6", "claims=[]", "formation.groups.g1.robots.r1.start=[0.3,1.2]", "avoidance.enabled=false"),
         "FAILS", "distance",
     ),
-    "limits act": (("lab", "duration=6", "claims=[]", "robot.torque_limit=0.05", "health.saturation=0.001"), "FAILS", "saturation"),
+    "limits act": (
+        ("lab", "duration=6", "claims=[]", "robot.torque_limit=0.05", "health.saturation=0.001"), "FAILS", "saturation",
+    ),
     "nothing arrives": (("lab", "duration=6", "claims=[]", 'links=[{channel="state", loss=1.0}]'), "FAILS", "messages"),
     "different periods": (
         ("three_levels", "duration=4", "claims=[]", "formation.period=0.04", "formation.groups.west.period=0.02"),
@@ -66,11 +68,13 @@ def test_the_batch_engine_gives_the_row_of_a_single_run(case: str) -> None:
         assert batch[name] == single[name], name
     lost = case == "is lost"  # its numbers are of any size
     for name in set(batch) - {"verdict", "reason"}:
-        if name.startswith(("decay_rate.", "age_p50.", "age_p95.")):
+        if name.startswith("decay_rate."):
             continue
         if name.startswith("growth.") and not min(single[name.replace("growth", "amplitude_before")]) > 1e-6:
             continue  # the ratio of two roundings
         found, expected = np.array(batch[name], dtype=float), np.array(single[name], dtype=float)
+        if name.startswith(("age_p50.", "age_p95.")) and np.isnan(found).all():
+            continue  # percentiles that the batch engine does not count
         assert (np.isnan(found) == np.isnan(expected)).all(), name
         if not lost:
             np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=name)

@@ -52,7 +52,7 @@ def test_growth_is_the_ratio_of_means_and_its_interval_covers_the_truth() -> Non
         # For X log-normal: E X² = exp(2 μ + 2 s²), and the factors are independent.
         covered += found.low <= np.exp(0.2 + 2 * 0.04) <= found.high
     assert 0.9 < covered / 400 < 0.99
-    assert NORMAL == pytest.approx(norm.ppf(0.975))
+    assert pytest.approx(norm.ppf(0.975)) == NORMAL
 
 
 def test_one_run_or_equal_runs_have_no_interval() -> None:

@@ -10,7 +10,7 @@ from echelon.errors import UsageError
 from echelon.sim.studies.running import Measured, command_of, measure, request_of
 from echelon.sim.studies.study_file import Number, parse_study, read_study, shipped_studies
 from echelon.sim.sweep.preparing import prepare
-from support.runs import plan_of
+from support.runs import ROOT, plan_of
 from support.studies import study as results
 
 SMALL: dict[str, Any] = {
@@ -98,3 +98,9 @@ def test_slow_leaders_and_coordinator_send_as_few_messages_as_the_finding_says()
     rates = [sum(1e9 / link.period_ns for link in plan_of("lab", *changes).links) for changes in ([], slow)]
     assert rates == [pytest.approx(2400), pytest.approx(190)]
     assert "190 instead of 2400 messages" in read_study("rates").finding.replace("\n", " ")
+
+
+@pytest.mark.parametrize("name", shipped_studies())
+def test_the_page_of_studies_has_the_finding_of_each(name: str) -> None:
+    page = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8")
+    assert f"(../deploy/studies/{name}.toml) | {' '.join(read_study(name).finding.split())} |" in page

@@ -15,6 +15,7 @@ import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_run import ruled_links
+from echelon.controller.prediction.random_delays import of_delays, varies
 from echelon.controller.prediction.random_run import Part, RandomRun
 from echelon.controller.prediction.random_steps import Chances, moment
 from echelon.controller.prediction.second_moment import SecondMoment
@@ -86,8 +87,16 @@ class Losses:
         if burst is not None:
             lossy, chained = lossy - {*self._varied}, self._varied
         in_bursts = [at for at in lossy - {*self._varied} if plan.links[at].bursts]
+        varying = [at for at, link in enumerate(plan.links) if varies(link)]
+        if varying and (len(varying) > 1 or in_bursts or chained or varying[0] in self._varied):
+            raise PredictionError(
+                "delays that vary are computed on one link, without losses in bursts and with its own loss"
+            )
         check_together(plan, [*in_bursts, *chained])
         self._chain = None
+        if varying:
+            self._chain = of_delays(plan.links[varying[0]])
+            lossy, chained = lossy - {*varying}, varying
         if in_bursts:
             self._chain = of_bursts(plan.links[in_bursts[0]])
             lossy, chained = lossy - {*in_bursts}, in_bursts

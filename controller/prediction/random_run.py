@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearStage
 from echelon.controller.prediction.policies import check_policy
+from echelon.controller.prediction.random_delays import check_delays, varies
 from echelon.controller.prediction.random_steps import Either, Indices, Linear, Step, Window, forced, needs
 from echelon.controller.prediction.registers import Registers, Role, Taking
 from echelon.messages import Channel
@@ -52,7 +53,7 @@ class RandomRun:
         self.plan = plan = with_message_sizes(replace(plan, avoidance=replace(plan.avoidance, enabled=False)))
         self.hyperperiod_ns = plan.root.period_ns
         self._lossy, self._chained = frozenset(lossy), frozenset(chained)
-        waits = _waits(plan, self._lossy | self._chained)
+        waits = _waits(plan, self._lossy | self._chained, self._chained)
         self.registers = Registers(plan, self._lossy, self._chained)
         made = self._event_driven() if waits else self._time_driven()
         self.steps = (*made, self.registers.shift())
@@ -173,12 +174,14 @@ def _levels(pairs: Iterable[tuple[Role, LinearStage]]) -> list[list[tuple[Role, 
     return [list(level) for _, level in groupby(pairs, key=lambda pair: pair[1].timed.level)]
 
 
-def _waits(plan: Plan, random: frozenset[int]) -> bool:
+def _waits(plan: Plan, random: frozenset[int], chained: frozenset[int]) -> bool:
     """Returns whether nodes wait for lost messages.  Raises PredictionError if the run cannot be treated."""
     for at, link in enumerate(plan.links):
         name = link.channel.name.lower()
-        if link.delay_min_ns != link.delay_max_ns or link.delays:
-            raise PredictionError(f"{name} links have delays that vary: losses are computed for constant delays")
+        if varies(link) and at in chained:
+            check_delays(plan, link)
+        elif varies(link):
+            raise PredictionError(f"several {name} links have delays that vary, or some that are lost in bursts, too")
         if at not in random and link.loss:
             raise PredictionError(f"{name} links lose messages in bursts of their own")
         check_policy(plan, link)

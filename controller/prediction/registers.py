@@ -12,6 +12,7 @@ from scipy.sparse import coo_array, csr_array
 
 from echelon.controller.prediction.linear_roles import MOTION, LinearNode, LinearRobot, LinearStage, moved, powers_of
 from echelon.controller.prediction.policies import Block, Policies
+from echelon.controller.prediction.random_delays import oldest, varies
 from echelon.controller.prediction.random_steps import Choice, Indices, Jump, Linear, Step
 from echelon.messages import Channel
 from echelon.plan.plan import Array, LinkPlan, Plan
@@ -119,10 +120,17 @@ class Registers:
         `came`: as far as all messages come, with the probability of that; `certain`: no message is lost."""
         before: list[Block] = []
         free: list[Block] = []
+        jumps: list[Step] = []
         ranks: list[list[tuple[int, Indices, Indices]]] = []
         for taking in takings:
             at = self.link(taking.receiver, taking.heard)
             link, wire = self.plan.links[at], self._wires[taking.heard.source, taking.heard.channel]
+            if at in self._chained and varies(link):
+                number = taking.now_ns // link.period_ns
+                jumps.append(
+                    Jump(self._held[at], tuple(wire.of(number - age) for age in range(oldest(link) + 1)), came)
+                )
+                continue
             numbers = range(_newest(link, taking.since_ns) + 1, _newest(link, taking.now_ns) + 1)
             if not certain and (at in self._lossy or at in self._chained):
                 for rank, number in enumerate(numbers):
@@ -136,6 +144,7 @@ class Registers:
                 before += taken.before
                 free.append((taken.dest, taken.source, np.eye(len(taken.dest))))
         steps: list[Step] = [self._linear(blocks) for blocks in (before, free) if blocks]
+        steps += jumps
         for drawn in ranks:
             steps += self._drawn(drawn, came=came)
         return steps
@@ -199,7 +208,8 @@ class Registers:
         self._held[at] = self._new(powers)
         self._policies.add(at, powers, self._new)
         wire = self._wires.setdefault((heard.source, heard.channel), _Wire(self.plan.root.period_ns // link.period_ns))
-        while wire.first > min(0, _newest(link, -stage.timed.period_ns) + 1) or not wire.places:
+        first = -oldest(link) if varies(link) else _newest(link, -stage.timed.period_ns) + 1
+        while wire.first > min(0, first) or not wire.places:
             wire.add(self._new, powers)
 
     def _new(self, powers: Sequence[int]) -> Indices:

@@ -13,11 +13,11 @@ N keeps X positive semidefinite, too.  So the spectral radius of L is below s > 
 is below 1 (as for regular splittings of nonnegative matrices; Varga, *Matrix Iterative Analysis*).  In K_s the slow modes are
 solved for, and few of its eigenvalues are not small.
 
-With a Markov chain there is an X for each mode, and M̄ is the mean over the modes' stationary probabilities π: X_j comes from
-π_j M̄ (Σ X_i) M̄ᵀ.  Then N need not keep X positive.  The spectral radius of L passes s where the largest real eigenvalue of
-K_s passes 1.
+With a Markov chain there is an X for each mode, and no such mean map.  Then the spectral radius of L is found by Arnoldi's
+method directly, and fails rather than being inexact where modes lie too close together.
 """
 
+from collections.abc import Callable
 from math import inf, log, sqrt
 from typing import Final
 
@@ -38,10 +38,14 @@ CONVERGED: Final = 1e-7
 """Relative accuracy of eigenvalues"""
 VECTORS: Final = 20
 """Dimension of the Krylov space"""
+CHAIN_VECTORS: Final = 60
+"""The same with a chain"""
+MOST: Final = 200
+"""Largest number of restarts"""
 SMALL: Final = 80
 """Size up to which maps of the second moment are computed as matrices"""
 EDGE: Final = 0.999
-"""With a chain M̄ is made smaller if its spectral radius is above this"""
+"""With a chain M̄ is made smaller if its spectral radius is above this share of √s"""
 
 
 class SecondMoment:
@@ -53,36 +57,46 @@ class SecondMoment:
         self.shape = (modes, size, size)
         self._pi = chances.stationary()[:, None, None]
         M = mean(part.steps, self._pi * np.eye(size), chances).sum(axis=0)
-        rate = float(np.abs(np.linalg.eigvals(M)).max())
-        if modes > 1 and rate > EDGE:
-            M, rate = M * (EDGE / rate), EDGE
         self._M = M
-        self.rate = rate
+        self.rate = float(np.abs(np.linalg.eigvals(M)).max())
         """ρ(M̄)"""
         self._solver: tuple[float, _Solver] | None = None
 
     def after(self, X: Array) -> Array:
         """Returns L(X); X is (modes, registers, registers)."""
-        return moment(self._part.steps, X, self._chances)
+        return np.asarray(moment(self._part.steps, X, self._chances))
 
     def gain(self, s: float = 1.0) -> float:
-        """Returns the largest real eigenvalue of K_s; infinite if s is not above ρ(M̄)²."""
+        """Returns a number that is below 1 if and only if the spectral radius of L is below s: the largest real eigenvalue of
+        K_s, or with a chain of L/s; infinite if s is not above ρ(M̄)²."""
+        if self.shape[0] > 1:
+            start = (self._pi * np.eye(self.shape[1])).ravel()
+            return self._largest(lambda X: self.after(X).ravel(), start, CHAIN_VECTORS) / s
         if not self.rate**2 < s:
             return inf
+        start = self._solved(np.eye(self.shape[1])[None], s).ravel()
 
-        def gained(vector: Array) -> Array:
-            X = vector.reshape(self.shape)
-            X = (X + X.transpose(0, 2, 1)) / 2
-            return self._solved(self.after(X) - self._of_mean(X), s).ravel()
+        def gained(X: Array) -> Array:
+            return self._solved(self.after(X) - self._of_mean(X, s), s).ravel()
 
-        start = self._solved(self._pi * np.eye(self.shape[1]), s).ravel()
-        if (after := float(np.abs(gained(start)).max())) < VANISHED * np.abs(start).max():
+        if (after := float(np.abs(gained(start.reshape(self.shape))).max())) < VANISHED * np.abs(start).max():
             return after
+        return self._largest(gained, start, VECTORS)
+
+    def _largest(self, of: Callable[[Array], Array], start: Array, vectors: int) -> float:
+        """Returns the largest real eigenvalue of a map of X."""
+
+        def symmetric(vector: Array) -> Array:
+            X = vector.reshape(self.shape)
+            return of((X + X.transpose(0, 2, 1)) / 2)
+
         if start.size <= SMALL:
-            return float(np.linalg.eigvals(np.array([gained(unit) for unit in np.eye(start.size)])).real.max())
-        operator = LinearOperator((start.size, start.size), gained, dtype=float)
+            return float(np.linalg.eigvals(np.array([symmetric(unit) for unit in np.eye(start.size)])).real.max())
+        operator = LinearOperator((start.size, start.size), symmetric, dtype=float)
         try:
-            found = eigs(operator, 1, which="LR", ncv=VECTORS, v0=start, tol=CONVERGED, return_eigenvectors=False)
+            found = eigs(
+                operator, 1, which="LR", ncv=vectors, v0=start, tol=CONVERGED, return_eigenvectors=False, maxiter=MOST
+            )
         except ArpackNoConvergence:
             raise PredictionError(
                 "the growth of the second moment is not found: the iteration does not converge"
@@ -91,6 +105,8 @@ class SecondMoment:
 
     def radius(self) -> float:
         """Returns the spectral radius of L."""
+        if self.shape[0] > 1:
+            return self.gain()
         low = self.rate**2 * (1 + 1e-9)
         if low == 0 or self.gain(low) <= 1:
             return self.rate**2
@@ -105,7 +121,7 @@ class SecondMoment:
 
         def rest(vector: Array) -> Array:
             X = vector.reshape(self.shape)
-            return vector - self._solved(self.after(X) - self._of_mean(X), 1.0).ravel()
+            return vector - self._solved(self.after(X) - self._of_mean(X, 1.0), 1.0).ravel()
 
         operator = LinearOperator((source.size, source.size), rest, dtype=float)
         found, failed = gmres(operator, source, rtol=1e-10, atol=0.0, restart=VECTORS, maxiter=100)
@@ -113,14 +129,20 @@ class SecondMoment:
             raise PredictionError("the sum of second moments is not found: the iteration does not converge")
         return np.asarray(found.reshape(self.shape))
 
-    def _of_mean(self, X: Array) -> Array:
+    def _mean_map(self, s: float) -> Array:
+        """Returns M̄; with a chain it is made smaller if s is not above ρ(M̄)²."""
+        largest = EDGE * sqrt(s)
+        return np.asarray(self._M * (largest / self.rate)) if self.shape[0] > 1 and self.rate > largest else self._M
+
+    def _of_mean(self, X: Array, s: float) -> Array:
         """Returns what M̄ makes of X."""
-        return np.asarray(self._pi * (self._M @ X.sum(axis=0) @ self._M.T))
+        M = self._mean_map(s)
+        return np.asarray(self._pi * (M @ X.sum(axis=0) @ M.T))
 
     def _solved(self, Y: Array, s: float) -> Array:
         """Returns X with s X = M̄ X M̄ᵀ + Y; s must be above ρ(M̄)²."""
         if self._solver is None or self._solver[0] != s:
-            self._solver = s, _Solver(self._M / sqrt(s))
+            self._solver = s, _Solver(self._mean_map(s) / sqrt(s))
         total = Y.sum(axis=0)
         return np.asarray((Y + self._pi * (self._solver[1].solved(total) - total)) / s)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from echelon.controller.prediction.linear_run import LinearRun, later
-from echelon.controller.prediction.mean_square import gilbert, mean_square
+from echelon.controller.prediction.mean_square import Losses, gilbert, mean_square
 from echelon.controller.prediction.random_run import RandomRun
 from echelon.controller.prediction.random_steps import Chances, moment
 from echelon.controller.prediction.second_moment import SecondMoment
@@ -202,3 +202,39 @@ def test_without_loss_typical_growth_is_that_of_the_map():
     plan = pair()
     found = typical_growth(plan, Channel.STATE, 0.0)
     assert found.rate == pytest.approx(np.log(spectral_radius(LinearRun(plan).map())), abs=2e-3)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+@pytest.mark.parametrize("gain", [2.0, 8.0])
+def test_delays_that_vary_are_those_of_all_delays_that_messages_may_have(gain, loss):
+    """One robot whose states take up to 1.5 periods: the joint chain of the delays of the last messages, by Kronecker
+    products."""
+    law = {"epsilon": [1.0], "gains": [{"k1": gain, "k2": 3.0}]}
+    links = [{"channel": "state", "delay": {"min": 0.0, "max": 1.5 * T}, "loss": loss}]
+    periods = {"acceleration": T, "torque": T}
+    timing = {"timing": "time_driven", "links": links}
+    plan = plan_of(scenario((None,), np.random.default_rng(1), duration=T, law=law, periods=periods, **timing))
+    losses = Losses(plan, (), None)
+
+    # In periods, rounded up: 0 has no probability, 1 two thirds, 2 one third; 9 is lost.
+    shares = {1: (1 - loss) * 2 / 3, 2: (1 - loss) / 3, 9: loss}
+    kinds = list(product(shares, repeat=2))  # delays of the messages of n - 1 and n - 2
+    move, push, K = np.array([[1, T], [0, 1]]), np.array([[T**2 / 2], [T]]), -np.array([[gain, 3.0]])
+    size = 8  # states of n, n - 1, n - 2, and the one in use at n - 1
+    kron = np.zeros((len(kinds) * size**2,) * 2)
+    for here, (one, two) in enumerate(kinds):
+        for delay, share in shares.items():
+            there = kinds.index((delay, one))
+            # At n the message of n - 1 is there if it took one period, that of n - 2 if it took two and n - 1 is not there;
+            # if it took one, it is in use already.
+            rows = slice(2, 4) if one == 1 else slice(4, 6) if two == 2 else slice(6, 8)
+            use = np.eye(size)[rows]
+            whole = np.zeros((size, size))
+            whole[:2] = np.hstack([move, np.zeros((2, 6))]) + push @ K @ use
+            whole[2:6], whole[6:] = np.eye(4, size), use
+            at, to = slice(here * size**2, (here + 1) * size**2), slice(there * size**2, (there + 1) * size**2)
+            kron[to, at] += share * np.kron(whole, whole)
+    expected = float(np.abs(np.linalg.eigvals(kron)).max())
+    for part in losses.parts:
+        found = SecondMoment(part, losses.chances(0.0))
+        assert found.gain(1.001 * expected) < 1 < found.gain(0.999 * expected)

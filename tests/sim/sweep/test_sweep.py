@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import echelon
-from echelon.controller.prediction.analysis import analyse
+from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.errors import UserError
 from echelon.messages import Channel
 from echelon.sim.sweep.folder import resumed
@@ -243,7 +243,7 @@ def desired_starts() -> Array:
 
 @pytest.mark.parametrize("channel", ["state", "group_state"])
 def test_near_the_formation_a_search_finds_the_predicted_delay(channel: str) -> None:
-    predicted = analyse(plan_of("lab")).later[Channel[channel.upper()]].seconds
+    predicted = largest_extra_delay(plan_of("lab"), Channel[channel.upper()]).seconds
     assert predicted is not None
     changes = near_formation(np.random.default_rng(1)) | {
         "claims": [], "links": [{"name": "up", "channel": channel}], "health.floor": 1e-9, "duration": 120.0,

@@ -10,7 +10,7 @@ QUICK := -m "not slow" tests/planning tests/plan tests/controller tests/agents t
   tests/bridge/protocols tests/bridge/timing tests/bridge/can tests/sim/results tests/sim/recording tests/sim/report \
   $(addprefix tests/cli/test_cli_help.py::, test_bash_knows_all_commands_and_all_options test_scripts_of_other_shells_know_the_commands)
 
-.PHONY: help setup demo docs test test-quick test-lowest test-newest lint bench lock clean
+.PHONY: help setup demo studies docs test test-quick test-lowest test-newest lint bench lock clean
 help: ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
@@ -40,6 +40,10 @@ demo: $(VENV)/.run ## the paper's nine robots as processes over Zenoh, without a
 	$(BIN)/echelon run paper --set avoidance.enabled=true --out runs/demo-avoidance
 	$(BIN)/echelon report runs/demo runs/demo-avoidance --out runs/demo.html
 	@echo "Look at runs/demo.html in a browser; runs/demo/ holds the recording, the CAN log and the summary."
+
+studies: $(VENV)/.run ## the shipped studies into runs/studies, and the README's figure of the largest delays
+	$(BIN)/echelon study all --out runs/studies --format svg
+	cp runs/studies/epsilon/figures/delay/tolerated.svg docs/delays.svg
 
 docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, public-names.md and the columns in sweep.md, from their source
 	$(BIN)/echelon schema scenario --markdown > docs/.new && mv docs/.new docs/scenario.md

@@ -49,6 +49,12 @@ def _sweep() -> Commands:
     return COMMANDS
 
 
+def _studies() -> Commands:
+    from echelon.cli.studies import COMMANDS
+
+    return COMMANDS
+
+
 def _results() -> Commands:
     from echelon.cli.results import COMMANDS
 
@@ -97,6 +103,8 @@ ENTRIES: Final = {
     "validate": Entry("check a scenario and say what it means", _scenario),
     "analyse": Entry("compute how much delay a scenario's control law bears", _scenario),
     "sweep": Entry("run a scenario many times, with values that vary, and search for what it bears", _sweep),
+    "figures": Entry("draw the figures of a sweep, with predictions beside what was measured", _studies),
+    "study": Entry("make a study: sweeps, figures, and a finding whose numbers are checked", _studies),
     "dbc": Entry("print the DBC of a scenario's drives, for cantools, SavvyCAN and the like", _scenario),
     "schema": Entry("print the schema of scenario files, for editors, or of summaries", _scenario),
     "report": Entry("write the report of a run, or a comparison of several", _results),

@@ -6,6 +6,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
@@ -127,14 +128,20 @@ def radii(axes: Axes, radius: float, sensing: float) -> None:
         )  # fmt: skip
 
 
+def plain_numbers(axis: Axis) -> None:
+    """Gives a logarithmic axis plain numbers: 0.2 instead of 2 × 10⁻¹; in less than two decades also those between."""
+    low, high = axis.get_view_interval()
+    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0) if low > 0 and high < 100 * low else ()))
+    for set_formatter in (axis.set_major_formatter, axis.set_minor_formatter):
+        set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
 def distance_limits(axes: Axes, shown: Array, radius: float, sensing: float) -> None:
     """Sets the limits and the label of an axis of distances so that both radii and all distances `shown` [m] are in it."""
     finite = shown[np.isfinite(shown)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (radius, sensing)
     axes.set_ylim(min(low, radius) / 1.6, max(high, sensing) * 1.6)
-    axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-    for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-        set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    plain_numbers(axes.yaxis)
     axes.set_ylabel("smallest distance [m]")
 
 

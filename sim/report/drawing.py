@@ -13,6 +13,7 @@ from typing import Any, Final, Self
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -40,6 +41,9 @@ COLUMNS: Final = 500
 """Columns of a picture; lines are thinned to the smallest and the largest value in each column."""
 DRAWABLE: Final = 1e9
 """Larger values are not drawn: otherwise they would hide everything else in the figures of a diverged run."""
+
+_HOVER: Final = "hover: "
+"""Ids of SVG elements that begin so become what browsers show beside the pointer"""
 
 _STYLE: Final[dict[str, Any]] = {
     "svg.fonttype": "none",
@@ -171,6 +175,7 @@ def _tidied(svg: str) -> str:
     with the page's font."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(rf'<g id="{_HOVER}([^"]*)">', r"<g><title>\1</title>", svg)
     used = set(re.findall(r"#([\w.-]+)", svg))
     svg = re.sub(r' id="([\w.-]+)"', lambda found: found[0] if found[1] in used else "", svg)
     # Only inside tags: numbers between them are text for people.
@@ -178,6 +183,11 @@ def _tidied(svg: str) -> str:
     svg = re.sub(r"font: ([\d.]+px) [^;\"]*", rf"font: \1 {FONT}", svg)
     svg = re.sub(r"font: (\w+ [\d.]+px) [^;\"]*", rf"font: \1 {FONT}", svg)
     return re.sub(r"\n\s*", "\n", svg)
+
+
+def hover(artist: Artist, text: str) -> None:
+    """Gives a part of a figure a text that browsers show while the pointer is on it (SVG alone)."""
+    artist.set_gid(_HOVER + text)
 
 
 def thin(times_ns: NDArray[np.int64], values: Array, log: bool) -> tuple[Array, Array]:

@@ -25,6 +25,7 @@ LONG = (
     "echelon observe",
     "echelon completion bash",
     "echelon sweep lab --set duration=30",
+    "echelon study",
 )
 """Beginnings of the examples that take long, or need a run that goes on.  They are not run, nor are those with `vcan0`, which
 need that interface."""
@@ -39,7 +40,7 @@ def run_in_shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder with three runs and a scenario."""
+    """A user's folder with three runs, a sweep and a scenario."""
     folder = tmp_path_factory.mktemp("user")
     quick = ("--set", "duration=0.5", "--set", "claims=[]", "--engine", "inprocess", "--quiet")
     for name in ("demo", "avoiding"):
@@ -48,6 +49,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     on_a_wall_clock = ("--clock", "wall", "--can", "none", *quick[:4], "--quiet", "--out", "runs/real")
     assert echelon("run", "lab", *on_a_wall_clock, cwd=folder).returncode in (0, 1)
     assert echelon("latencies", "runs/real", cwd=folder).returncode == 0
+    several = ("--set", "duration=3", "--vary", "law.lead=0:1:0.5", "--quiet", "--out", "runs/many")
+    assert echelon("sweep", "lab", *several, cwd=folder).returncode == 0
     assert echelon("new", "my", "--groups", "1x2", cwd=folder).returncode == 0
     (folder / "my.toml").rename(folder / "kept.toml")
     return folder

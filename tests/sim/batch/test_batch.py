@@ -45,6 +45,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "lab": ("lab", "duration=40"),
     "integral": ("integral", "duration=6"),
     "sliding": ("sliding", "duration=6"),
+    "crossing": ("crossing", "duration=8"),
     "unequal": ("unequal", "duration=8"),
     "three_levels": ("three_levels", "duration=4"),
     "multi": ("multi", "duration=2"),

@@ -155,7 +155,7 @@ def test_a_busy_core_does_not_matter(tmp_path: Path) -> None:
     assert outcome.trace.digest() == trace_of(plan).digest()
 
 
-@pytest.mark.parametrize("scenario", ["unequal", "three_levels", "multi", "integral", "sliding"])
+@pytest.mark.parametrize("scenario", ["unequal", "three_levels", "multi", "integral", "sliding", "crossing"])
 def test_every_tree_gives_the_trace_of_one_process(tmp_path: Path, scenario: str) -> None:
     plan = plan_of(scenario, "duration=0.4", "avoidance.enabled=true")
     outcome = supervised(plan, tmp_path)

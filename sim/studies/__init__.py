@@ -1,0 +1,1 @@
+"""Studies: sweeps with predictions, figures and a finding (docs/studies.md)."""

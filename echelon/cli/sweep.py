@@ -49,10 +49,13 @@ class SweepOptions:
     )
     find: str | None = field(
         default=None,
-        metadata=option("search for the largest value that holds, for each point of what varies", "KEY=LO:HI:STEP"),
+        metadata=option(
+            "search for the largest value at which enough runs hold and E|e|² does not grow, at each point of what varies",
+            "KEY=LO:HI:STEP",
+        ),
     )
     share: float = field(
-        default=0.9, metadata=option("a point of the search holds if at least this share of its runs does", "P")
+        default=0.9, metadata=option("share of its runs that must hold for a point of the search to hold", "P")
     )
     seeds: int | None = field(
         default=None,

@@ -5,11 +5,15 @@ these that does not hold, in ascending order, and halves the distance to the one
 result is the value up to which everything that was tried holds.  It does not assume that all values above it fail: if one of
 those holds, the result says so.
 
-A point has two judgements, each searched for by itself:
+A point has two judgements, and holds if it holds by both.  Each has a boundary of its own, too:
 
 by             a point holds if
+both           it holds by share and by second moment
 share          the share of its runs that hold is at least `wanted`
 second moment  E|e|² of no block grows from the sixth of the run before the last to the last one (`statistics.moment_growth`)
+
+Neither is enough by itself: with random loss most runs may hold while E|e|² grows, and an error that has grown into a limit
+cycle grows no more, but ends larger than it began.
 
 Runs are random, so each judgement has an interval.  A point *surely* holds if all of its interval holds, and surely fails if
 none of it does.  The boundary lies between the last value up to which all points surely hold, and the first that surely fails.
@@ -25,8 +29,8 @@ from echelon.sim.sweep.values import TAKEN, Span, parse_span
 COARSE: Final = 8
 STEPS: Final = 256
 """Number of steps of a range that was given without one"""
-By = Literal["share", "second moment"]
-BOTH: Final[tuple[By, ...]] = ("share", "second moment")
+By = Literal["both", "share", "second moment"]
+ALL: Final[tuple[By, ...]] = ("both", "share", "second moment")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,14 @@ class Judged:
 
 
 Judgements = Mapping[By, Judged]
+
+
+def judgements(share: Judged, moment: Judged) -> Judgements:
+    """Returns all judgements of a point from those by share and by second moment."""
+    holds = share.holds and moment.holds
+    deciding = (share, moment) if holds else [one for one in (share, moment) if not one.holds]
+    surely = (all if holds else any)(one.surely for one in deciding)
+    return {"both": Judged(holds, surely), "share": share, "second moment": moment}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +69,8 @@ class Found:
     """Up to this value all points that were tried surely hold; None if there is none"""
     high: float | None
     """The smallest value that surely fails; None if there is none"""
+    limited_by: tuple[By, ...] = ()
+    """Which of share and second moment do not hold at `fails`"""
     again: tuple[float, ...] = ()
     """Values above `fails` that hold all the same: what is asked for is not monotone.  With random runs, those that surely
     hold, above one that surely fails"""
@@ -65,12 +79,13 @@ class Found:
     def text(self) -> str:
         """The boundary in a sentence."""
         beside = ", ".join(f"{key} = {value}" for key, value in self.at.items())
-        begin = f"{self.key} by {self.by}{f' ({beside})' if beside else ''}: "
+        by, limit = ("", f" by {' and '.join(self.limited_by)}") if self.by == "both" else (f" by {self.by}", "")
+        begin = f"{self.key}{by}{f' ({beside})' if beside else ''}: "
         if self.value is None:
-            return f"{begin}fails even at {self.fails:g}{self._more}"
+            return f"{begin}fails even at {self.fails:g}{limit}{self._more}"
         if self.fails is None:
             return f"{begin}all values hold, up to {self.value:g}; give a larger range{self._more}"
-        return f"{begin}holds up to {self.value:g}, fails at {self.fails:g}{self._more}"
+        return f"{begin}holds up to {self.value:g}, fails at {self.fails:g}{limit}{self._more}"
 
     @property
     def _more(self) -> str:
@@ -129,7 +144,7 @@ class Search:
         last = self.span.steps
         known = dict((yield sorted({round(part * last / COARSE) for part in range(COARSE + 1)})))
         bounds: dict[By, tuple[int | None, int | None]] = {}
-        for by in BOTH:
+        for by in ALL:
             while True:
                 numbers = sorted(known)
                 failing = [number for number in numbers if not known[number][by].holds]
@@ -172,5 +187,6 @@ class Search:
             fails=value(fails),
             low=value(sure_until),
             high=value(first),
+            limited_by=() if fails is None else tuple(one for one in ALL[1:] if not known[fails][one].holds),
             again=tuple(float(self.value(number)) for number in again),
         )

@@ -165,6 +165,9 @@ def write_find(found: Sequence[Found], path: Path) -> None:
 def _read_find(path: Path) -> tuple[Found, ...]:
     entries = _read_json(path)
     return tuple(
-        Found(**{name: value for name, value in entry.items() if name != "text"} | {"again": tuple(entry["again"])})
+        Found(
+            **{name: value for name, value in entry.items() if name != "text"}
+            | {name: tuple(entry[name]) for name in ("limited_by", "again")}
+        )
         for entry in entries
     )

@@ -13,7 +13,7 @@ from echelon.sim.sweep.journal import Journal
 from echelon.sim.sweep.origin import Point
 from echelon.sim.sweep.preparing import Prepared, beside, draws
 from echelon.sim.sweep.rows import Rows, blocks_of, channels_of
-from echelon.sim.sweep.search import BOTH, By, Found, Judged, Judgements, Search
+from echelon.sim.sweep.search import ALL, By, Found, Judged, Judgements, Search, judgements
 from echelon.sim.sweep.statistics import MomentGrowth, wilson
 from echelon.sim.sweep.study import Sweep
 from echelon.sim.sweep.tables import Layout, PointFacts, growth_of_point, points_table, runs_table, values_text
@@ -95,7 +95,7 @@ class _Run:
                     bounds[at] = end.value
         for at, point in enumerate(prepared.points):
             others = dict(zip(keys, point.values, strict=True))
-            self.found += [search.found(by, known[at], bounds[at][by], others) for by in BOTH]
+            self.found += [search.found(by, known[at], bounds[at][by], others) for by in ALL]
 
     def _try(self, points: Sequence[Point]) -> None:
         """Makes the runs of some points."""
@@ -131,7 +131,7 @@ class _Run:
         runs, holds = len(facts.seeds), sum(facts.rows["holds"])
         low, high = wilson(holds, runs) if draws(plan) else (holds / runs, holds / runs)
         good = holds >= wanted * runs
-        judged: dict[By, Judged] = {"share": Judged(good, low >= wanted if good else high < wanted)}
+        share = Judged(good, low >= wanted if good else high < wanted)
         bound, judges = plan.health.growth**2, list[MomentGrowth]()
         for block in blocks_of(plan):
             growth = growth_of_point(facts, block)
@@ -139,10 +139,8 @@ class _Run:
             if growth.ratio == inf or (growth.ratio == growth.ratio and level > plan.health.floor):
                 judges.append(growth)
         if any(growth.ratio > bound for growth in judges):
-            judged["second moment"] = Judged(False, any(growth.low > bound for growth in judges))
-        else:
-            judged["second moment"] = Judged(True, all(growth.high <= bound for growth in judges))
-        return judged
+            return judgements(share, Judged(False, any(growth.low > bound for growth in judges)))
+        return judgements(share, Judged(True, all(growth.high <= bound for growth in judges)))
 
     def facts(self) -> list[PointFacts]:
         """Returns all points of which runs are finished, in the order of the tables."""

@@ -83,7 +83,7 @@ def test_json_has_the_points_and_what_was_found(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["points"][0]["links.up.loss"] == 0.0
-    assert {each["by"] for each in found["find"]} == {"share", "second moment"}
+    assert {each["by"] for each in found["find"]} == {"both", "share", "second moment"}
     assert "with 2 seeds" not in done.stderr
     assert "can be shown with 35 seeds or more" in done.stderr
 

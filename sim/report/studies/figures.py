@@ -83,8 +83,14 @@ STUDY_FIGURES: Final[Mapping[str, StudyFigure]] = {
         tolerated,
         _bounded,
         lambda of: (
-            f"Largest value with which at least {100 * HOLDS:g} % of the runs hold, {_runs(of)} for each value. Bars: from the "
-            "last value that surely holds to the first that surely fails." + _dashed(of, "predicted")
+            "Largest value with which "
+            + (
+                "the wanted share of runs holds and E|e|² does not grow"
+                if of.found
+                else f"{100 * HOLDS:g} % of the runs hold"
+            )
+            + f", {_runs(of)} for each value. Bars: from the last value that surely holds to the first that surely fails."
+            + _dashed(of, "predicted")
         ),
     ),
     "settling": StudyFigure(

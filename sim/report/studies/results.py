@@ -200,11 +200,12 @@ class StudyResults:
         return Look(GROUPS[number % len(GROUPS)], Look.of_group(number).dashes, MARKS[number % len(MARKS)])
 
     def boundaries(self) -> list[Boundary]:
-        """Returns how far points hold along the axis: those that were searched for, otherwise those in the table.
+        """Returns how far points hold along the axis: as the search found it, by share and by second moment; without a search
+        from the table, by share alone.
 
-        The value is the last one up to which every point holds (`HOLDS`)."""
+        The value is the last one up to which every point holds; those of the table hold if `HOLDS` of their runs do."""
         if self.found:
-            return [one for one in self.found if one.by == "share"]
+            return [one for one in self.found if one.by == "both"]
         axis = self.axis
         return [] if axis is None else [self._boundary(axis, one.rows) for one in self.series(axis)]
 

@@ -119,13 +119,19 @@ def test_the_largest_delays_are_drawn_against_a_second_key_with_predictions_besi
 
 
 def test_what_each_policy_buys_is_a_bar_for_each() -> None:
-    found = (Boundary({"links.0.policy": "hold"}, 0.35, 0.36), Boundary({"links.0.policy": "predict"}, 2.5))
+    found = (
+        Boundary({"links.0.policy": "hold"}, 0.35, 0.36, by="both"),
+        Boundary({"links.0.policy": "hold"}, 0.6, 0.61, by="second moment"),
+        Boundary({"links.0.policy": "predict"}, 2.5, by="both"),
+    )
     searched = study({"links.0.policy": POLICIES, DELAY: DELAYS})
     results = replace(searched, found=found, searched=DELAY)
     (axes,) = drawn(results, "tolerated").axes
     assert [round(bar.get_width(), 3) for bar in axes.patches] == [0.35, 2.5]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["policy hold", "policy predict"]
     assert "2.5 or more" in " ".join(text.get_text() for text in axes.texts)
+    caption = study_figures(results)["tolerated"][1]
+    assert caption.startswith("Largest value with which the wanted share of runs holds and E|e|² does not grow, 8 runs")
 
 
 def test_rates_and_costs_have_their_predictions_beside_them() -> None:

@@ -250,10 +250,24 @@ def test_near_the_formation_a_search_finds_the_predicted_delay(channel: str) -> 
     }  # fmt: skip
     span = f"{predicted - 0.03:.3f}:{predicted + 0.03:.3f}:0.001"
     found = echelon.sweep("lab", changes, find={"links.up.delay": span}, quiet=True)
-    by_share, by_moment = found.find
-    assert by_moment.value == pytest.approx(predicted, rel=0.01)
-    assert by_share.value == pytest.approx(predicted, rel=0.01)
+    assert [each.value for each in found.find] == [pytest.approx(predicted, rel=0.01)] * 3
     assert found.runs["seed"].tolist() == [1] * len(found.runs)  # nothing is random, so one run at a point says all
+
+
+def test_a_limit_cycle_does_not_hold_though_it_grows_no_more(tmp_path: Path) -> None:
+    changes = {
+        "claims": [], "duration": 30.0, "law.epsilon": [0.3, 0.3], "avoidance.enabled": False,
+        "robot.torque_limit": 1e6, "robot.torque_rate_limit": 1e9, "robot.wheel_speed_limit": 1e6, "robot.envelope": {},
+        "links": [{"name": "up", "channel": "state"}],
+    }  # fmt: skip
+    found = echelon.sweep("lab", changes, find={"links.up.delay": "0:0.4:0.05"}, out=tmp_path, quiet=True)
+    both, by_share, by_moment = found.find
+    assert (both.value, both.fails, both.limited_by) == (0.1, 0.15, ("share",))
+    assert both.text == "links.up.delay: holds up to 0.1, fails at 0.15 by share"
+    assert (by_share.value, by_share.fails) == (0.1, 0.15)
+    assert by_moment.value is not None
+    assert by_moment.value > 0.1
+    assert echelon.open_sweep(tmp_path).find == found.find
 
 
 def test_a_search_beside_a_varied_key_has_a_boundary_for_each_value() -> None:
@@ -268,7 +282,7 @@ def test_a_search_beside_a_varied_key_has_a_boundary_for_each_value() -> None:
         quiet=True,
     )
     assert [(dict(each.at), each.by) for each in found.find] == [
-        ({"links.up.loss": loss}, by) for loss in (0.0, 0.01) for by in ("share", "second moment")
+        ({"links.up.loss": loss}, by) for loss in (0.0, 0.01) for by in ("both", "share", "second moment")
     ]
     assert found.keys == ("links.up.loss", "links.up.delay")
     order = list(zip(found.points["links.up.loss"], found.points["links.up.delay"], strict=True))

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -132,8 +132,14 @@ def _request(options: SweepOptions) -> "Request":
     from echelon.sim.sweep.values import parse_vary
 
     if options.resume is not None:
-        if options.scenario or options.vary or options.find or options.overrides or options.out or options.seeds:
-            raise UsageError(f"--resume {options.resume}: takes scenario, values and seeds from that folder; give none")
+        kept = replace(
+            SweepOptions(), resume=options.resume, workers=options.workers, quiet=options.quiet, json=options.json
+        )
+        if options != kept:
+            raise UsageError(
+                f"--resume {options.resume}: takes scenario, values and seeds from that folder; "
+                "beside it only --workers, --quiet and --json can be given"
+            )
         return resumed(options.resume)
     if options.scenario is None:
         raise UsageError("give a scenario, or the folder of a sweep with --resume")

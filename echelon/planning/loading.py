@@ -158,9 +158,9 @@ def _override(table: dict[str, Any], override: str) -> str:
     last = chunks[-1]
     if isinstance(at, list):
         index = _index(at, last)
-        at[index : index + 1] = [_value(text)]
+        at[index : index + 1] = [value_of(text)]
     elif isinstance(at, dict):
-        at[last] = _value(text)
+        at[last] = value_of(text)
     else:
         raise OverrideError(f"{short(last)} would stand in a value, not in a table")
     return key_text(chunks)
@@ -217,7 +217,7 @@ def _index(array: list[Any], chunk: str) -> int:
     return int(chunk)
 
 
-def _value(text: str) -> Any:
+def value_of(text: str) -> Any:
     """Returns the value of a text in TOML.  A text that is not TOML is returned as a string, so that strings need no quotes."""
     try:
         table = tomllib.loads(f"value = {text}")

@@ -45,7 +45,10 @@ def command_of(part: SweepPart) -> str:
     for option, values in (("--set", part.set), ("--vary", part.vary)):
         words += [word for value in values for word in (option, value)]
     words += ["--zip"] if part.zip else []
-    for option, value in (("--find", part.find), ("--seeds", part.seeds), ("--engine", part.engine)):
+    share = None if part.find is None else part.share
+    for option, value in (
+        ("--find", part.find), ("--share", share), ("--seeds", part.seeds), ("--engine", part.engine)
+    ):  # fmt: skip
         words += [] if value is None else [option, str(value)]
     return shlex.join(words)
 

@@ -93,13 +93,23 @@ def parse_study(table: Mapping[str, Any], name: str, where: str) -> Study:
         for number, each in enumerate(_tables(table, "numbers", where))
     ]
     names = [one.name for one in sweeps]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"{where}: sweeps: two of them have the name {twice[0]!r}")
     for number in numbers:
-        if number.sweep not in names:
-            raise UsageError(f"{where}: numbers: there is no sweep {number.sweep!r}; there are {', '.join(names)}")
+        for place in (number, *([] if number.over is None else [_divisor(number, where)])):
+            if place.sweep not in names:
+                raise UsageError(f"{where}: numbers: there is no sweep {place.sweep!r}; there are {', '.join(names)}")
         if not isfinite(number.value) or not number.within >= 0:
             raise UsageError(f"{where}: numbers: {number.says!r}: value and within must be finite, within at least 0")
     rest = {key: value for key, value in table.items() if key not in ("scenario", "sweeps", "numbers")}
     return _made(Study, {**rest, "name": name, "sweeps": tuple(sweeps), "numbers": tuple(numbers)}, where)
+
+
+def _divisor(number: Number, where: str) -> Number:
+    """Returns the place of the number that another one is divided by, as a number.  Raises UsageError."""
+    own = {"says": number.says, "value": number.value, "within": number.within}
+    place = {"sweep": number.sweep, "column": number.column, "at": number.at}
+    return _made(Number, {**own, **place, **(number.over or {})}, f"{where}: numbers: {number.says!r}: over")
 
 
 def _tables(table: Mapping[str, Any], key: str, where: str) -> Sequence[Mapping[str, Any]]:
@@ -120,7 +130,8 @@ def _made(kind: type[Kind], values: Mapping[str, Any], where: str) -> Kind:
     for key, value in values.items():
         text = str(known[key].type)
         fits = (
-            isinstance(value, (list, tuple)) if "tuple" in text
+            isinstance(value, (list, tuple)) and all(isinstance(each, str) for each in value) if "tuple[str" in text
+            else isinstance(value, tuple) if "tuple" in text
             else isinstance(value, Mapping) if "Mapping" in text
             else isinstance(value, (int, float)) if "float" in text
             else isinstance(value, bool if "bool" in text else int if "int" in text else str)

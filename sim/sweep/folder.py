@@ -4,11 +4,11 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from echelon.errors import UsageError
 from echelon.files import lock, write_text
@@ -19,7 +19,7 @@ from echelon.sim.sweep import journal
 from echelon.sim.sweep.origin import Origin
 from echelon.sim.sweep.preparing import SHARE, Prepared, Request
 from echelon.sim.sweep.search import Search
-from echelon.sim.sweep.study import FIND, FORMAT, POINTS, RUNS, SWEEP, Sweep, write_find
+from echelon.sim.sweep.study import FIND, POINTS, RUNS, SWEEP, Sweep, read_spec, write_find
 from echelon.sim.sweep.tables import write_csv, write_parquet
 from echelon.sim.sweep.values import Span, Vary
 
@@ -87,24 +87,8 @@ def _span(varied: Vary) -> list[str | None] | None:
     return None if span is None else [str(span.low), str(span.high), None if span.step is None else str(span.step)]
 
 
-def read_spec(folder: Path) -> Mapping[str, Any]:
-    """Returns the design in the folder of a sweep.  Raises UsageError if there is none, or none of this format."""
-    path = folder / SWEEP
-    try:
-        spec = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"{folder}: is not the folder of a sweep, there is no {SWEEP}") from None
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
-    except ValueError as error:
-        raise UsageError(f"{path}: is not JSON: {error}") from None
-    if not isinstance(spec, dict) or spec.get("format") != FORMAT:
-        raise UsageError(f"{path}: is not a sweep that this version can read")
-    return spec
-
-
 def resumed(folder: Path) -> Request:
-    """Returns the request of the sweep in a folder, to go on with it.  Raises UsageError."""
+    """Returns the request of the sweep in a folder, to go on with it.  Raises UserError."""
     spec = read_spec(folder)
     try:
         origin, request, find = spec["origin"], spec["request"], spec["find"]

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -108,10 +108,8 @@ class Sweep:
 def open_sweep(folder: str | Path) -> Sweep:
     """Returns the sweep in a folder.  Raises UserError if it is not the folder of a sweep, or a file of it cannot be read."""
     folder = Path(folder)
-    spec = _read_json(folder / SWEEP)
+    spec = read_spec(folder)
     try:
-        if spec["format"] != FORMAT:
-            raise UserError(f"{folder / SWEEP}: is of format {spec['format']}, and this version reads {FORMAT}")
         first, count = spec["seeds"]
         find = spec["find"]
         keys = (*spec["keys"], *(() if find is None else (find["key"],)))
@@ -132,6 +130,14 @@ def open_sweep(folder: str | Path) -> Sweep:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{folder / SWEEP}: is damaged ({type(error).__name__}: {error})") from None
+
+
+def read_spec(folder: Path) -> Mapping[str, Any]:
+    """Returns the design in the folder of a sweep.  Raises UserError if there is none, or none of this format."""
+    spec = _read_json(folder / SWEEP)
+    if not isinstance(spec, dict) or spec.get("format") != FORMAT:
+        raise UserError(f"{folder / SWEEP}: is not a sweep that this version can read")
+    return spec
 
 
 def _header(path: Path) -> list[str]:

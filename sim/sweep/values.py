@@ -8,6 +8,7 @@ from decimal import Decimal
 from typing import Any, Final
 
 from echelon.errors import UsageError
+from echelon.planning.loading import value_of
 from echelon.scenario.toml_text import toml_value
 
 MOST_VALUES: Final = 1_000_000
@@ -119,16 +120,8 @@ def _listed(text: str) -> tuple[Any, ...]:
     try:
         table = tomllib.loads(f"values = [{text}]")
     except (ValueError, RecursionError):
-        return tuple(_value(part) for part in text.split(","))
+        return tuple(value_of(part) for part in text.split(","))
     return tuple(table["values"]) if len(table) == 1 else tuple(text.split(","))
-
-
-def _value(text: str) -> Any:
-    try:
-        table = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):
-        return text.strip()
-    return table["value"] if len(table) == 1 else text.strip()
 
 
 def _unique(values: tuple[Any, ...], where: str) -> tuple[Any, ...]:

@@ -54,6 +54,11 @@ def test_the_sweeps_of_shipped_studies_can_begin(name: str) -> None:
         ({"sweeps": [{"vary": []}]}, "sweeps.0: name: is missing"),
         ({"sweeps": [{"name": "a", "seeds": "many"}]}, "sweeps.0: seeds = 'many': is of the wrong type"),
         ({"numbers": [NUMBER | {"sweep": "b"}]}, "numbers: there is no sweep 'b'; there are a"),
+        ({"sweeps": [{"name": "a", "vary": [0.5]}]}, r"sweeps.0: vary = \[0.5\]: is of the wrong type"),
+        ({"sweeps": [{"name": "a"}, {"name": "a"}]}, "sweeps: two of them have the name 'a'"),
+        ({"numbers": [NUMBER | {"over": {"sweep": "b"}}]}, "numbers: there is no sweep 'b'; there are a"),
+        ({"numbers": [NUMBER | {"over": {"at": 1}}]}, "numbers: '1.5': over: at = 1: is of the wrong type"),
+        ({"numbers": [NUMBER | {"over": {"rows": 1}}]}, "numbers: '1.5': over: rows: there is no such key"),
         ({"numbers": [NUMBER | {"within": -1.0}]}, "numbers: '1.5': value and within must be finite"),
     ],
 )

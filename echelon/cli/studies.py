@@ -32,8 +32,12 @@ def figures(options: FiguresOptions) -> int:
     from echelon.sim.sweep.study import open_sweep
 
     out = options.out or options.sweep / "figures"
-    results = results_of(open_sweep(options.sweep), predict=not options.no_predictions)
-    scenario = (options.sweep / EFFECTIVE).read_text(encoding="utf-8")
+    sweep = open_sweep(options.sweep)
+    try:
+        scenario = (options.sweep / EFFECTIVE).read_text(encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{error.filename}: {error.strerror}") from None
+    results = results_of(sweep, predict=not options.no_predictions)
     try:
         written = save_study_figures(results, out, options.format or ("svg",))
         write_study_page(results, out / "index.html", scenario)

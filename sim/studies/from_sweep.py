@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
 from echelon.sim.parts import loading
@@ -72,7 +73,10 @@ class _Predictor:
         values = sorted({float(self.axis.numbers[row]) for row in rows})
         if len(values) < 2:
             return None
-        found, known = boundary(lambda value: self._plan(rows[0], value), values)
+        try:
+            found, known = boundary(lambda value: self._plan(rows[0], value), values)
+        except UserError:  # a value between two that were tried is not allowed: a period that divides no other one
+            return None
         if not known or found == np.inf:
             return None
         at = {key.name: key.texts[rows[0]] for key in self.results.others(self.axis)}
@@ -85,7 +89,7 @@ class _Predictor:
             own: Any = self.results.points[key.name][row : row + 1].tolist()[0]
             if value is not None and key.name == self.axis.name:
                 own = value
-            changes.append(f"{key.name}={own!r}" if isinstance(own, float) else f"{key.name}={own}")
+            changes.append(f"{key.name}={own:.17g}" if isinstance(own, float) else f"{key.name}={own}")  # 64, not 64.0
         return loading.parse(self.text, str(self.folder), changes, self.folder, trial=False)[1]
 
     def _rates(self) -> Columns:

@@ -1,0 +1,41 @@
+"""From finished sweeps to what their figures are drawn from: every sweep that can be made can be drawn."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import echelon
+from echelon.sim.report.studies.figures import study_figures
+from echelon.sim.studies.from_sweep import results_of
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "more"),
+    [
+        ("can.queue", [64, 128, 256], {"duration": 0.1}),  # a key that takes whole numbers alone
+        (
+            "periods.acceleration",
+            [0.1, 0.8, 1.6],
+            {"duration": 1.6},
+        ),  # of the periods between these few divide the duration
+    ],
+)
+def test_a_key_that_does_not_take_all_numbers_can_be_drawn(
+    key: str, values: list[float], more: dict[str, Any], tmp_path: Path
+) -> None:
+    changes = {"claims": [], "avoidance.enabled": False, **more}
+    sweep = echelon.sweep("lab", changes, vary={key: values}, engine="inprocess", out=tmp_path, quiet=True)
+    results = results_of(sweep)
+    assert results.axis is not None
+    assert results.axis.name == key
+    assert not results.predicted.boundaries
+    assert "integrals" in study_figures(results)
+
+
+def test_a_search_is_drawn_as_far_as_it_holds_by_both_judgements(tmp_path: Path) -> None:
+    changes = {"links": [{"name": "up", "channel": "state"}], "claims": [], "duration": 20.0}
+    sweep = echelon.sweep("lab", changes, find={"links.up.delay": "0:1:0.5"}, out=tmp_path, quiet=True)
+    results = results_of(sweep)
+    assert [one.by for one in results.found] == ["both", "share", "second moment"]
+    assert [(one.by, one.value, one.fails) for one in results.boundaries()] == [("both", 0.0, 0.5)]

@@ -7,7 +7,9 @@ from support.runs import echelon
 
 
 def test_what_is_not_the_folder_of_a_sweep_is_one_line(tmp_path: Path) -> None:
-    library.sweep("lab", {"duration": 0.1, "claims": []}, vary={"law.lead": [0, 0.5, 1]}, out=tmp_path / "a", quiet=True)
+    library.sweep(
+        "lab", {"duration": 0.1, "claims": []}, vary={"law.lead": [0, 0.5, 1]}, out=tmp_path / "a", quiet=True
+    )
     (tmp_path / "a" / "scenario.toml").unlink()
     for folder, said in (("a", "a/scenario.toml: No such file"), ("b", "b: is not the folder of a sweep")):
         done = echelon("figures", tmp_path / folder)

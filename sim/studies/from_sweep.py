@@ -1,6 +1,6 @@
 """From a finished sweep to what its figures are drawn from, with predictions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -12,12 +12,16 @@ from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
 from echelon.sim.parts import loading
 from echelon.sim.report.studies.results import Boundary, Columns, Key, Predicted, StudyResults
-from echelon.sim.studies.predictions import boundary, decay_rates
+from echelon.sim.studies.predictions import boundary, costs, decay_rates
 from echelon.sim.sweep.search import Found
 from echelon.sim.sweep.study import Sweep
 
 MOST_RATES: Final = 400
 """Points up to which decay rates are predicted"""
+MOST_COSTS: Final = 100
+"""Points up to which costs are predicted"""
+MOST_ROBOTS: Final = 12
+"""Robots up to which costs are predicted"""
 
 
 def results_of(sweep: Sweep, *, predict: bool = True) -> StudyResults:
@@ -62,7 +66,7 @@ class _Predictor:
             bounds = [
                 one for line in results.series(self.axis) if (one := self._of_series(line.rows.tolist())) is not None
             ]
-        return Predicted(tuple(bounds), "", self._rates())
+        return Predicted(tuple(bounds), self._rates(), self._costs())
 
     def _is_number(self) -> bool:
         """The values of the axis are numbers, not lists that one number tells."""
@@ -98,6 +102,17 @@ class _Predictor:
         measured = any(np.isfinite(results.numbers(f"decay_rate.{block}")).any() for block in results.blocks)
         if not measured or count > MOST_RATES:
             return {}
-        rows = [decay_rates(self._plan(row)) for row in range(count)]
-        found = {block: np.array([row.get(block, np.nan) for row in rows]) for block in results.blocks}
+        return self._columns([decay_rates(self._plan(row)) for row in range(count)])
+
+    def _costs(self) -> Columns:
+        """Returns the expected cost of each block at each point, where losses vary."""
+        count = len(self.results.points["point"])
+        if self.axis.kind != "loss" or count > MOST_COSTS:
+            return {}
+        plans = [self._plan(row) for row in range(count)]
+        return self._columns([costs(plan) if len(plan.robots) <= MOST_ROBOTS else {} for plan in plans])
+
+    def _columns(self, rows: Sequence[Mapping[str, float]]) -> Columns:
+        """Returns the numbers of each block at all points as a column, for blocks that have one."""
+        found = {block: np.array([row.get(block, np.nan) for row in rows]) for block in self.results.blocks}
         return {block: column for block, column in found.items() if np.isfinite(column).any()}

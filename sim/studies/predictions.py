@@ -1,4 +1,4 @@
-"""What can be predicted about a sweep without runs: boundaries of stability, and decay rates of single blocks."""
+"""What can be predicted about a sweep without runs: boundaries of stability, decay rates of single blocks, and costs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import ceil
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.controller.laws.law import LinearGains
+from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError, linear_gains, poles
 from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_links, untreated
@@ -107,6 +108,16 @@ def decay_rates(plan: Plan) -> Mapping[str, float]:
         }
     except PredictionError:
         return {}
+
+
+def costs(plan: Plan) -> Mapping[str, float]:
+    """Returns the expected integral of the squared error of each block [m² s], until all errors have vanished; empty if they do
+    not vanish in the mean square, or if nothing exact can be said."""
+    try:
+        cost = expected_cost(plan)
+    except PredictionError:
+        return {}
+    return {} if cost is None else {block.name: block.value for block in cost.blocks}
 
 
 def loop_delay(plan: Plan, block: BlockPlan) -> float:

@@ -54,7 +54,7 @@ def _runs(results: StudyResults) -> str:
 
 
 def _dashed(results: StudyResults, words: str) -> str:
-    return f" Dashed: {words}{results.predicted.assumed}." if results.predicted.boundaries else ""
+    return f" Dashed: {words}." if results.predicted.boundaries else ""
 
 
 STUDY_FIGURES: Final[Mapping[str, StudyFigure]] = {

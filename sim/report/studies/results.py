@@ -101,8 +101,6 @@ class Predicted:
 
     boundaries: tuple[Boundary, ...] = ()
     """Largest values of the study's first key that are stable"""
-    assumed: str = ""
-    """The kind of stability that `boundaries` are about, in words"""
     rates: Columns = field(default_factory=dict)
     """Decay rate of each block at each point [1/s]"""
     costs: Columns = field(default_factory=dict)

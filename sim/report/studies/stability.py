@@ -123,7 +123,7 @@ def stability_map(results: StudyResults, width: float) -> Picture:
         words = ["no run holds", "half of the runs hold", "all runs hold", "measured boundary"]
         if results.predicted.boundaries:
             marks.append(Line2D([], [], **PREDICTED))
-            words.append(f"predicted{results.predicted.assumed}")
+            words.append("predicted")
         figure.legend(marks, words, loc="outside lower center", ncols=len(words), handlelength=3)
 
     return Picture(width, min(width / columns * 0.62, 5.6) * rows + 0.5, draw)
@@ -290,6 +290,6 @@ def _legend(figure: Figure, results: StudyResults, lines: Sequence[Series]) -> N
     words = [one.name for one in lines if one.name]
     if results.predicted.boundaries:
         handles.append(Line2D([], [], **PREDICTED))
-        words.append(f"predicted{results.predicted.assumed}")
+        words.append("predicted")
     if handles:
         figure.legend(handles, words, loc="outside lower center", ncols=4, handlelength=3)

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import echelon
@@ -39,3 +40,20 @@ def test_a_search_is_drawn_as_far_as_it_holds_by_both_judgements(tmp_path: Path)
     results = results_of(sweep)
     assert [one.by for one in results.found] == ["both", "share", "second moment"]
     assert [(one.by, one.value, one.fails) for one in results.boundaries()] == [("both", 0.0, 0.5)]
+
+
+def test_expected_costs_are_those_of_the_runs_and_are_drawn_against_them(tmp_path: Path) -> None:
+    """Without loss the one run is the mean; with it the cost grows."""
+    changes = {
+        "claims": [], "duration": 30.0, "periods.acceleration": 0.05, "avoidance.enabled": False,
+        "robot.torque_limit": 1e6, "robot.torque_rate_limit": 1e9, "robot.wheel_speed_limit": 1e6, "robot.envelope": {},
+        "links": [{"name": "up", "channel": "state"}],
+    }  # fmt: skip
+    sweep = echelon.sweep("lab", changes, vary={"links.up.loss": [0.0, 0.2, 0.4]}, out=tmp_path, quiet=True)
+    results = results_of(sweep)
+    assert list(results.predicted.costs) == ["g1", "g2", "g3", "inter", "centroid"]
+    for block, expected in results.predicted.costs.items():
+        assert expected[0] == pytest.approx(results.points[f"ise_mean.{block}"][0], rel=2e-3)
+        assert (np.diff(expected) > 0).all()
+    assert "costs" in study_figures(results)
+    assert not results_of(sweep, predict=False).predicted.costs

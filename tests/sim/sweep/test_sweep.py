@@ -270,6 +270,15 @@ def test_a_limit_cycle_does_not_hold_though_it_grows_no_more(tmp_path: Path) -> 
     assert echelon.open_sweep(tmp_path).find == found.find
 
 
+@pytest.mark.parametrize(("seeds", "sure"), [(2, 0.0), (34, 0.0), (35, 0.2)])
+def test_a_share_is_sure_with_enough_runs_or_where_nothing_is_random(seeds: int, sure: float) -> None:
+    changes = UP | {"duration": 1.0}
+    found = echelon.sweep("lab", changes, find={"links.up.loss": "0:0.2:0.1"}, seeds=seeds, quiet=True)
+    by_share = found.find[1]
+    assert (by_share.by, by_share.value, by_share.fails) == ("share", 0.2, None)
+    assert by_share.low == sure
+
+
 def test_a_search_beside_a_varied_key_has_a_boundary_for_each_value() -> None:
     changes = UP | {"duration": 20.0}
     found = echelon.sweep(

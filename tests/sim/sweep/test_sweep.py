@@ -272,7 +272,7 @@ def test_a_limit_cycle_does_not_hold_though_it_grows_no_more(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(("seeds", "sure"), [(2, 0.0), (34, 0.0), (35, 0.2)])
 def test_a_share_is_sure_with_enough_runs_or_where_nothing_is_random(seeds: int, sure: float) -> None:
-    changes = UP | {"duration": 1.0}
+    changes = UP | {"duration": 25.0, "health.off": ["saturation"]}
     found = echelon.sweep("lab", changes, find={"links.up.loss": "0:0.2:0.1"}, seeds=seeds, quiet=True)
     by_share = found.find[1]
     assert (by_share.by, by_share.value, by_share.fails) == ("share", 0.2, None)

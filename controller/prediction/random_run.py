@@ -89,11 +89,7 @@ class RandomRun:
         rising = [pair for pair in self.registers.stages() if pair[1].timed.turn in (Turn.SAY, Turn.GATHER)]
         up, came = (
             tuple(
-                step
-                for level in _levels(rising)
-                for step in self.registers.acts(
-                    level, wait_ns if level[0][1].timed.turn is Turn.GATHER else 0, came=only
-                )
+                step for level in _levels(rising) for step in self.registers.acts(level, 0, wait_ns=wait_ns, came=only)
             )
             for only in (False, True)
         )

@@ -4,6 +4,7 @@ in the engine with robots that are points."""
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
+from math import ceil, floor
 
 import numpy as np
 import pytest
@@ -101,12 +102,22 @@ def random_plan(tree: Sequence[object], seed: int, **tables: object) -> Plan:
     (((None, None),), True, 1),
     (((None,), (None,)), True, 0),
     ((((None,),),), False, 0),
+    (((None,), (None,)), False, 0.3),
+    (((None,), None), True, 1.6),
 ])  # fmt: skip
 def test_second_moment_is_the_mean_over_all_patterns_of_loss(tree, timing, broadcast, ticks, monkeypatch):
-    plan = later(random_plan(tree, 3, timing=timing), Channel.STATE, ticks * round(T * 1e9))
+    plan = later(random_plan(tree, 3, timing=timing), Channel.STATE, round(ticks * T * 1e9))
     check_patterns(
         replace(plan, links=tuple(replace(link, loss_of_message=broadcast) for link in plan.links)), monkeypatch
     )
+
+
+@pytest.mark.parametrize("timing", ["time_driven", "event_driven"])
+@pytest.mark.parametrize("ticks", [0.0, 0.5, 1.0, 1.5, 29.5])
+def test_without_loss_the_second_moment_grows_as_the_linear_run_does(ticks, timing):
+    plan = later(random_plan(((None, None), (None,)), 4, timing=timing), Channel.STATE, round(ticks * T * 1e9))
+    losses = Losses(plan, (), None)
+    assert losses.radius(0.0) == pytest.approx(spectral_radius(LinearRun(plan).map()) ** 2, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +149,9 @@ def check_patterns(plan: Plan, patch: pytest.MonkeyPatch) -> None:
         for at, link in enumerate(plan.links)
     ]
     losses = losses[draw]
-    late = [link.delay_min_ns // link.period_ns for link in plan.links]
+    # Event-driven nodes wait within their period for what comes in it, time-driven ones take it in the next one.
+    rounded = floor if plan.root.event_driven else ceil
+    late = [rounded(link.delay_min_ns / link.period_ns) for link in plan.links]
     # With late states, nothing is known in the first periods, and nothing is commanded.
     random = 1 + 2 * max(late)
     hyperperiods = random + 3

@@ -112,11 +112,13 @@ class LinearRun:
         robots = [LinearRobot(plan, robot) for robot in plan.robots]
         nodes = [LinearNode(plan, node) for node in plan.nodes]
         self._roles: list[LinearRobot | LinearNode] = [*robots, *nodes]
-        self._stages = sorted(
+        self.stages = sorted(
             (stage for role in self._roles for stage in role.stages), key=lambda stage: stage.timed.level
         )
-        self._tick_ns = gcd(*(stage.timed.period_ns for stage in self._stages))
-        self._schedule = schedule(plan, [stage.timed for stage in self._stages])
+        """All stages, in the order of their levels"""
+        self._tick_ns = gcd(*(stage.timed.period_ns for stage in self.stages))
+        self.schedule = schedule(plan, [stage.timed for stage in self.stages])
+        """For each stage when it acts, and with which messages"""
         self._places = [0]
         """Where in x the memory of each role begins, and where the last one ends"""
         for role in self._roles:
@@ -127,7 +129,7 @@ class LinearRun:
         """Returns the periods of all stages [ns], or of the stages that use messages of some links."""
         return {
             stage.timed.period_ns
-            for stage in self._stages
+            for stage in self.stages
             if late is None
             or any((heard.source, stage.timed.member, heard.channel) in late for heard in stage.timed.inputs)
         }
@@ -150,7 +152,7 @@ class LinearRun:
         plan = self.plan
         periods = {(link.source, link.channel): link.period_ns for link in plan.links}
         wires: dict[_Key, _Wire] = {}
-        for stage, acts in zip(self._stages, self._schedule, strict=True):
+        for stage, acts in zip(self.stages, self.schedule, strict=True):
             for act in (act for some in acts.values() for act in some):
                 for heard, number in zip(stage.timed.inputs, act.used, strict=True):
                     at = heard.source, heard.channel
@@ -191,7 +193,7 @@ class LinearRun:
         said: dict[tuple[_Wire, int], Array] = {}
 
         for time_ns in range(0, hyperperiod_ns, self._tick_ns):
-            for stage, acts in zip(self._stages, self._schedule, strict=True):
+            for stage, acts in zip(self.stages, self.schedule, strict=True):
                 if time_ns not in acts:
                     continue
                 member = stage.timed.member

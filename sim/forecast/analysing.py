@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf, isfinite
 from typing import Final
 
-from echelon.controller.prediction.analysis import Analysis, analyse
+from echelon.controller.prediction.analysis import analyse
 from echelon.controller.prediction.block_margin import delay_margin
 from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError, linear_gains
@@ -71,7 +71,9 @@ def analysis_of(
     skipped: list[str] = []
     table = tuple(_table(plan, members, say)) if found.settles else ()
     say("ε and couplings", 0, 1)
-    epsilons, coupling = _time_scales(plan, time_scales, epsilon, found, skipped)
+    blocks = tuple(_modes(plan))
+    is_stable_alone = all(one.poles[0][0] < 0 for one in blocks)
+    epsilons, coupling = _time_scales(plan, time_scales, epsilon, is_stable_alone, found.settles, skipped)
     return AnalysisResult(
         scenario=plan.name,
         assumptions=_assumptions(plan),
@@ -84,7 +86,7 @@ def analysis_of(
         spectral_radius=found.radius,
         time_constant=_finite(found.time_constant),
         centroid_age=found.centroid_age,
-        blocks=tuple(_modes(plan)),
+        blocks=blocks,
         settling=tuple(SettlingResult(one.block, one.band, one.settled) for one in predicted_settling(plan)),
         table=table,
         epsilon=epsilons,
@@ -191,9 +193,11 @@ def _cost_shares(plan: Plan) -> dict[str, float]:
 
 
 def _time_scales(
-    plan: Plan, time_scales: str, epsilon: Sequence[float], found: Analysis, skipped: list[str]
+    plan: Plan, time_scales: str, epsilon: Sequence[float], is_stable_alone: bool, settles: bool, skipped: list[str]
 ) -> tuple[tuple[EpsilonResult, ...], CouplingResult | None]:
-    """Returns how far ε and couplings may go; adds to `skipped` what is not computed."""
+    """Returns how far ε and couplings may go; adds to `skipped` what is not computed.
+
+    `is_stable_alone`: each block is, in continuous time; then every ε is where nothing is coupled."""
     counts = epsilon_counts(plan, time_scales)
     try:
         loop = None if not plan.coupled else error_dynamics(plan, counts)
@@ -203,16 +207,16 @@ def _time_scales(
     bounds = None if loop is None else lyapunov_bounds(loop, epsilon)
     epsilons = []
     for at, value in enumerate(epsilon):
-        low, high = epsilon_range(plan, counts, epsilon, at + 1) if found.settles else (0.0, 0.0)
-        sampled = (low or None, _finite(high) or None)
+        low, high = epsilon_range(plan, counts, epsilon, at + 1) if settles else (0.0, inf)
+        sampled = (low or None, _finite(high))
         if loop is None or bounds is None:
-            epsilons.append(EpsilonResult(value, False, None, None, None, None, None, *sampled))
+            uncoupled = None if is_stable_alone else 0.0
+            epsilons.append(EpsilonResult(value, *(uncoupled,) * 4, None, *sampled))
             continue
         layers = loop.up_to(at + 1)
         epsilons.append(
             EpsilonResult(
                 value,
-                True,
                 _finite(largest_epsilon(loop, epsilon, at + 1)),
                 _finite(largest_epsilon(layers, epsilon, at + 1)),
                 _finite(bounds[at].corrected),
@@ -223,7 +227,7 @@ def _time_scales(
         )
     if loop is None:
         return tuple(epsilons), None
-    sampled_limit = coupling_limit(plan) if found.settles else inf
+    sampled_limit = coupling_limit(plan) if settles else inf
     return tuple(epsilons), CouplingResult(_finite(largest_coupling(loop)), _finite(sampled_limit))
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from echelon.controller.prediction.cost import block_rows, registers_at_rest
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.mean_square import Losses, places_of
-from echelon.controller.prediction.random_steps import Chances, mean
+from echelon.controller.prediction.random_branches import mean
+from echelon.controller.prediction.random_steps import Chances
 from echelon.messages import Channel
 from echelon.plan.plan import Array, LinkPlan, Plan
 

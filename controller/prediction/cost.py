@@ -19,8 +19,9 @@ import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.mean_square import Losses, of_bursts
+from echelon.controller.prediction.random_branches import mean, moment
 from echelon.controller.prediction.random_run import Part
-from echelon.controller.prediction.random_steps import Chances, mean, moment
+from echelon.controller.prediction.random_steps import Chances
 from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation

@@ -15,9 +15,10 @@ import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_run import ruled_links
+from echelon.controller.prediction.random_branches import moment
 from echelon.controller.prediction.random_delays import of_delays, varies
 from echelon.controller.prediction.random_run import Part, RandomRun
-from echelon.controller.prediction.random_steps import Chances, moment
+from echelon.controller.prediction.random_steps import Chances
 from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.messages import Channel
 from echelon.plan.delay_tables import Bursts

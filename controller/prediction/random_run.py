@@ -22,8 +22,9 @@ from scipy.sparse.csgraph import connected_components
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearStage
 from echelon.controller.prediction.policies import check_policy
+from echelon.controller.prediction.random_branches import Either, Window, forced, needs
 from echelon.controller.prediction.random_delays import check_delays, varies
-from echelon.controller.prediction.random_steps import Either, Indices, Linear, Step, Window, forced, needs
+from echelon.controller.prediction.random_steps import Indices, Linear, Step
 from echelon.controller.prediction.registers import Registers, Role, Taking
 from echelon.messages import Channel
 from echelon.plan.layout import with_message_sizes

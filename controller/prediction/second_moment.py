@@ -28,8 +28,9 @@ from scipy.optimize import brentq
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, gmres
 
 from echelon.controller.prediction.gains import PredictionError
+from echelon.controller.prediction.random_branches import mean, moment
 from echelon.controller.prediction.random_run import Part
-from echelon.controller.prediction.random_steps import Chances, mean, moment
+from echelon.controller.prediction.random_steps import Chances
 from echelon.plan.plan import Array
 
 VANISHED: Final = 1e-12

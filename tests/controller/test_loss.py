@@ -11,8 +11,9 @@ import pytest
 
 from echelon.controller.prediction.linear_run import LinearRun, later
 from echelon.controller.prediction.mean_square import Losses, gilbert, mean_square
+from echelon.controller.prediction.random_branches import moment
 from echelon.controller.prediction.random_run import RandomRun
-from echelon.controller.prediction.random_steps import Chances, moment
+from echelon.controller.prediction.random_steps import Chances
 from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.controller.prediction.typical_growth import typical_growth

@@ -94,6 +94,7 @@ class Losses:
                 "delays that vary are computed on one link, without losses in bursts and with its own loss"
             )
         check_together(plan, [*in_bursts, *chained])
+        check_broadcasts(plan, frozenset(self._varied))
         self._chain = None
         if varying:
             self._chain = of_delays(plan.links[varying[0]])
@@ -122,6 +123,19 @@ class Losses:
         losses = self._others.copy()
         losses[self._varied] = loss
         return Chances.of(losses, self._chain)
+
+
+def check_broadcasts(plan: Plan, varied: frozenset[int]) -> None:
+    """Raises PredictionError if a message that is lost for all receivers at once would be lost with different probabilities."""
+    losses: dict[tuple[int, Channel], set[float | None]] = {}
+    for at, link in enumerate(plan.links):
+        if link.loss_of_message:
+            losses.setdefault((link.source, link.channel), set()).add(None if at in varied else link.loss)
+    for (_, channel), found in losses.items():
+        if len(found) > 1:
+            raise PredictionError(
+                f"{channel.name.lower()} messages are lost for all receivers at once: all their links must have the same loss"
+            )
 
 
 def check_together(plan: Plan, chained: Sequence[int]) -> None:

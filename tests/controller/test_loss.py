@@ -9,6 +9,8 @@ from math import ceil, floor
 import numpy as np
 import pytest
 
+from echelon.controller.prediction.cost import expected_cost
+from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_run import LinearRun, later
 from echelon.controller.prediction.mean_square import Losses, gilbert, mean_square
 from echelon.controller.prediction.random_branches import moment
@@ -176,6 +178,24 @@ def check_patterns(plan: Plan, patch: pytest.MonkeyPatch) -> None:
         X = moment(run.steps, X, chances)
     places = np.concatenate([registers.memory(number) for number in range(len(plan.robots))])
     assert X[0][np.ix_(places, places)] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def test_what_is_not_exact_is_refused():
+    broadcast = pair(links=[{"channel": "command", "loss": 0.1, "loss_of": "message"}])
+    (first, *others) = [link for link in broadcast.links if link.channel is Channel.COMMAND]
+    assert mean_square(broadcast, [first, *others]).loss is not None
+    with pytest.raises(PredictionError, match="lost for all receivers at once"):
+        mean_square(broadcast, [first])
+    uneven = tuple(replace(link, loss=0.2) if link is first else link for link in broadcast.links)
+    with pytest.raises(PredictionError, match="lost for all receivers at once"):
+        mean_square(replace(broadcast, links=uneven), Channel.STATE)
+    varying = pair(links=[{"channel": "command", "receiver": "r0", "delay": {"min": 0.0, "max": 1.5 * T}}])
+    assert mean_square(varying, Channel.STATE).loss is not None
+    robots = tuple(replace(robot, event_driven=True) for robot in varying.robots)
+    with pytest.raises(PredictionError, match="time-driven robots"):
+        mean_square(replace(varying, robots=robots), Channel.STATE)
+    with pytest.raises(PredictionError, match="states whose delays do not vary"):
+        expected_cost(pair(links=[{"channel": "state", "source": "r0", "delay": {"min": 0.0, "max": 1.5 * T}}]))
 
 
 @pytest.mark.parametrize("burst", [1.5, 4.0])

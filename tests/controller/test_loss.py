@@ -16,7 +16,7 @@ from echelon.controller.prediction.mean_square import Losses, gilbert, mean_squa
 from echelon.controller.prediction.random_branches import moment
 from echelon.controller.prediction.random_run import RandomRun
 from echelon.controller.prediction.random_steps import Chances
-from echelon.controller.prediction.second_moment import SecondMoment
+from echelon.controller.prediction.second_moment import SecondMoment, Solver
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.controller.prediction.typical_growth import typical_growth
 from echelon.messages import Channel
@@ -178,6 +178,15 @@ def check_patterns(plan: Plan, patch: pytest.MonkeyPatch) -> None:
         X = moment(run.steps, X, chances)
     places = np.concatenate([registers.memory(number) for number in range(len(plan.robots))])
     assert X[0][np.ix_(places, places)] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 64, 65, 171])
+def test_equations_of_any_size_are_solved(size):
+    """X = M X Mᵀ + Y, with complex eigenvalues of M wherever a large equation is halved."""
+    random = np.random.default_rng(size)
+    M, Y = random.normal(size=(size, size)) / (1.2 * np.sqrt(size)), random.normal(size=(size, size))
+    X = Solver(M).solved(Y)
+    assert pytest.approx(M @ X @ M.T + Y, abs=1e-9 * np.abs(X).max()) == X
 
 
 def test_what_is_not_exact_is_refused():

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
+from echelon.controller.prediction.linear_run import lags
 from echelon.controller.prediction.mean_square import Losses, of_bursts
 from echelon.controller.prediction.random_branches import mean, moment
 from echelon.controller.prediction.random_delays import varies
@@ -75,6 +76,10 @@ def expected_cost(plan: Plan) -> Cost | None:
     None if errors do not vanish in the mean square.
 
     Raises PredictionError if nothing exact can be said of the plan."""
+    if lags(plan):
+        raise PredictionError(
+            'with law.reference = "now" and late states errors of a moving formation do not vanish: their cost has no limit'
+        )
     losses = Losses(plan, (), None)
     if losses.gain(0.0) >= 1:
         return None

@@ -63,6 +63,13 @@ def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
     return tuple(link for link in plan.links if not link.steady or link.policy in (EXTRAPOLATE, PREDICT))
 
 
+def lags(plan: Plan) -> bool:
+    """Returns whether a moving formation keeps an error that the linear run does not have: late positions are compared with the
+    reference of the present (`law.reference = "now"`)."""
+    up = (Channel.STATE, Channel.GROUP_STATE)
+    return plan.reference == "now" and any(link.delay_max_ns or link.loss for link in plan.links if link.channel in up)
+
+
 def edges_of(plan: Plan, late: Channel | Edges) -> Edges:
     """Returns the links of a channel of `CHANNELS`, or these links themselves."""
     return late if isinstance(late, frozenset) else frozenset(map(edge_of, ruled_links(plan, late)))

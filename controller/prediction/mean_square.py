@@ -47,9 +47,7 @@ class LossBoundary:
     burst: float | None
     """Mean length of the bursts of losses [messages]; None: each message is lost by itself"""
     radius: float
-    """Spectral radius of L at the plan's own mean loss: E|x|² is multiplied by it in each hyperperiod"""
-    estimate: bool = False
-    """True if the boundary is an estimate from random runs; False if it is exact"""
+    """Spectral radius of L with the largest loss of these links in the plan: E|x|² is multiplied by it in each hyperperiod"""
 
 
 def mean_square(plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float | None = None) -> LossBoundary:

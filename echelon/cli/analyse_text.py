@@ -154,8 +154,7 @@ def _loss(found: "LossResult | None") -> str:
         return "?"
     if found.share is None:
         return "none"
-    about = "about " if found.estimate else "over " if found.ends == "limit" else ""
-    return f"{about}{100 * found.share:.3g} %"
+    return f"{'over ' if found.ends == 'limit' else ''}{100 * found.share:.3g} %"
 
 
 def _named(one: "LinksResult") -> str:

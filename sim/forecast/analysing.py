@@ -120,11 +120,13 @@ def scaled_delays(plan: Plan, time_scales: str, epsilon: Sequence[float], say: S
 
 def _assumptions(plan: Plan) -> tuple[str, ...]:
     bus = ("bus and drives take no time",) if plan.can.closed else ()
+    events = ("blackouts of links are left out",) if any(link.blackouts for link in plan.links) else ()
     return (
         "robots follow the desired accelerations exactly",
         "no limit acts",
         "avoidance does not act",
         *bus,
+        *events,
         "the delays are constant, and beyond those of the scenario",
     )
 
@@ -141,7 +143,7 @@ def _table(plan: Plan, members: bool, say: Say) -> Iterable[LinksResult]:
         loss = None
         if one.kind == "class":
             why = f"only computed for up to {MOST} robots, here are {count}" if count > MOST else ""
-            loss = LossResult(None, "not computed", False, why) if why else _loss(plan, one.edges)
+            loss = LossResult(None, "not computed", why) if why else _loss(plan, one.edges)
         yield _links(one, known[one.edges], loss)
 
 
@@ -150,8 +152,8 @@ def _loss(plan: Plan, edges: Edges) -> LossResult:
     try:
         found = mean_square(plan, [link for link in plan.links if edge_of(link) in edges])
     except PredictionError as error:
-        return LossResult(None, "not computed", False, str(error))
-    return LossResult(found.loss, found.ends, found.estimate, "")
+        return LossResult(None, "not computed", str(error))
+    return LossResult(found.loss, found.ends, "")
 
 
 def _links(one: LinkSet, found: LargestDelay, loss: LossResult | None = None) -> LinksResult:

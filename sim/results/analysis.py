@@ -34,8 +34,6 @@ class LossResult:
     """Largest share of lost messages; None: unstable even without loss, or not computed"""
     ends: str
     """`unstable`: with a larger share the mean square grows; `limit`: larger shares were not tried; `not computed`"""
-    estimate: bool
-    """True: estimated from random runs, not computed"""
     why: str
     """Why it is not computed; empty if it is"""
 
@@ -194,7 +192,7 @@ class AnalysisResult:
     blocks: tuple[ModesResult, ...]
     """Modes of the blocks"""
     settling: tuple[SettlingResult, ...]
-    """Predicted settling; empty for more than 200 robots"""
+    """Predicted settling; empty for more than 200 robots, and where `law.reference = "now"` and states are late"""
     table: tuple[LinksResult, ...]
     """What links bear; empty if the scenario does not settle"""
     epsilon: tuple[EpsilonResult, ...]

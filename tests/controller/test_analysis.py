@@ -3,6 +3,9 @@
 import pytest
 
 from echelon.controller.prediction.analysis import analyse
+from echelon.controller.prediction.cost import expected_cost
+from echelon.controller.prediction.gains import PredictionError
+from echelon.sim.forecast.settling import predicted_settling
 from echelon.sim.results.block_series import block_series
 from support.near_formation import near_formation
 from support.runs import trace_of
@@ -25,6 +28,9 @@ LATE = {"channel": "state", "source": "g0/r0", "delay": 0.055}
 ])  # fmt: skip
 def test_a_moving_formation_is_off_by_its_velocity_times_the_age_of_positions(links, timing, age):
     plan = near_formation(links, timing, reference="now")
+    assert predicted_settling(plan) == ()
+    with pytest.raises(PredictionError, match="do not vanish"):
+        expected_cost(plan)
     assert analyse(plan).centroid_age == pytest.approx(age, abs=1e-9)
     (*_, centroid) = block_series(trace_of(plan)).series
     assert centroid.norm[-1] == pytest.approx(SPEED * age, abs=0.002 * SPEED)

@@ -12,10 +12,13 @@ os.environ.setdefault(
     "OPENBLAS_NUM_THREADS", "1"
 )  # before numpy is imported: for small matrices its threads only cost time
 
+from echelon.cli.output import Output, patient_output
 from echelon.errors import PartRunError, UserError, one_line
 
 DEBUG = "ECHELON_DEBUG"
 """Environment variable: set to 1, it does the same as the option `--debug`."""
+NOBODY_READS = 141
+"""Exit code of a command that prints until it is stopped, when its reader has ended; as of programs that SIGPIPE ends"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,17 +28,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0     done, and the verdict does not fail
     1     done, and the verdict fails
     2     a mistake of the user
-    3     it could not be done, or not to its end
+    3     it could not be done, or not to its end, or not be printed
+    141   nobody reads any more what it prints until it is stopped
 
     An error is one line on standard error.  Ends the process for `--help` and for wrong arguments, as argparse does."""
+    with patient_output() as output:
+        return _main(arguments, output)
+
+
+def _main(arguments: Sequence[str] | None, output: Output | None) -> int:
     debug = os.environ.get(DEBUG, "") not in ("", "0")
     try:
         from echelon.cli.parser import read
 
         call = read(arguments)
         debug = debug or call.debug
+        if output is not None:
+            output.live = call.live
         code = call.work()
-        print(end="", flush=True)  # here, so that an error of it is caught below
+        print(end="", flush=True)  # here, so that an error of it is known below
+        if output is not None and output.trouble is not None and not isinstance(output.trouble, BrokenPipeError):
+            print(f"echelon: standard output: {output.trouble.strerror}", file=sys.stderr)
+            return code or 3
         return code
     except UserError as error:
         if debug and error.__cause__ is not None:  # the exception that a user's part raised
@@ -44,9 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exception(error.__cause__)
         print(f"echelon: {error}", file=sys.stderr)
         return 3 if isinstance(error, PartRunError) else 2
-    except BrokenPipeError:  # the reader of the output has ended, for example `head`
-        _drop_output()
-        return 0
+    except BrokenPipeError:
+        return NOBODY_READS
     except KeyboardInterrupt:
         print("echelon: interrupted", file=sys.stderr)
         return 3
@@ -57,16 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         else:
             print(_error_line(error), file=sys.stderr)
-        try:
-            print(end="", flush=True)
-        except OSError:  # the output cannot be written; the interpreter would try again when it ends
-            _drop_output()
         return 3
-
-
-def _drop_output() -> None:
-    """Discards the output that is not written yet."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _error_line(error: Exception) -> str:

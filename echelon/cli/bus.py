@@ -145,6 +145,7 @@ def drives(options: DrivesOptions) -> int:
 COMMANDS: Final[tuple[Command[Any], ...]] = (
     Command(
         name="drives",
+        live=True,
         options=DrivesOptions,
         work=drives,
         about="""\
@@ -160,6 +161,7 @@ times counted from the start of this command.""",
     ),
     Command(
         name="can",
+        live=True,
         options=CanOptions,
         work=can,
         about="""\

@@ -60,6 +60,7 @@ def observe(options: ObserveOptions) -> int:
 COMMANDS: Final = (
     Command(
         name="observe",
+        live=True,
         options=ObserveOptions,
         work=observe,
         about="""\

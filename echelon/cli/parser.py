@@ -123,10 +123,12 @@ ENTRIES: Final = {
 
 
 class Call(NamedTuple):
-    """A command with its options.  `work` runs it and returns the exit code; `debug` is the option `--debug`."""
+    """A command with its options.  `work` runs it and returns the exit code; `debug` is the option `--debug`; `live` is that of
+    the command."""
 
     work: Callable[[], int]
     debug: bool
+    live: bool
 
 
 def read(arguments: Sequence[str] | None = None) -> Call:
@@ -137,7 +139,7 @@ def read(arguments: Sequence[str] | None = None) -> Call:
     parsed = make_parser([name for name in ENTRIES if name in words]).parse_args(words)
     command: Command[Any] = parsed.command
     options = command.read_options(parsed)
-    return Call(lambda: command.work(options), parsed.debug)
+    return Call(lambda: command.work(options), parsed.debug, command.live)
 
 
 def make_parser(names: Collection[str] = ENTRIES.keys()) -> ArgumentParser:

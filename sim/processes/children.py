@@ -124,8 +124,10 @@ def warm_up() -> None:
     """Starts the fork server, which imports the processes' modules in the background.  Call it early."""
     context = get_context("forkserver")
     context.set_forkserver_preload(PRELOAD)
-    from multiprocessing import forkserver, resource_tracker
+    from multiprocessing import forkserver, resource_tracker, util
 
+    # In Python 3.11.0 any user could give the fork server work through a socket without a file (CVE-2022-42919).
+    setattr(util, "abstract_sockets_supported", False)  # noqa: B010  a constant, for type checkers
     with _on_its_own():
         resource_tracker.ensure_running()  # before the mask is set, since its start changes the mask
     # Ctrl-C reaches all processes of the terminal, but only this one must react, not one that is importing

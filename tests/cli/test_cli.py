@@ -119,7 +119,10 @@ def test_plain_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("run", "nosuch"), "nosuch: no such file, and no shipped scenario; those are drives, integral, lab,"),
+        (
+            ("run", "nosuch"),
+            "nosuch: no such file, and no shipped scenario; those are crossing, drives, integral, lab,",
+        ),
         (("validate", "no/such.toml"), "no/such.toml: No such file"),
         (("run", "paper", "--set", "law.epsilon=[0.1]"), "law.epsilon"),
         (("run", "paper", "--set", "duratoin=3"), "did you mean 'duration'"),

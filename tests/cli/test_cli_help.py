@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from echelon.cli import main
 from echelon.cli.machine import completion_script
 from echelon.cli.parser import ENTRIES, FIRST_LOOK, make_parser
 from support.runs import ROOT, echelon
@@ -137,26 +138,41 @@ def test_a_mistake_in_the_arguments_is_one_line(arguments: tuple[str, ...], says
     assert not list(tmp_path.iterdir())
 
 
-# Unexpected errors: here, output that cannot be written
+# Unexpected errors
 
 
-def test_an_unexpected_error_is_one_line_that_says_where_it_was_and_how_to_see_more() -> None:
-    done = run_in_shell("echelon dbc lab > /dev/full", ROOT)
-    assert done.returncode == 3
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("echelon: OSError: [Errno 28] No space left on device (")
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes every command raise an error that nobody expects."""
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("a mistake\nof ours")
+
+    monkeypatch.setattr("echelon.cli.scenario_file.read_scenario", fails)
+
+
+@pytest.mark.usefixtures("broken")
+def test_an_unexpected_error_is_one_line_that_says_where_it_was_and_how_to_see_more(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["dbc", "lab"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(r"echelon: RuntimeError: a mistake\nof ours (")
     assert ".py:" in line
     assert line.endswith("; --debug or ECHELON_DEBUG=1 shows the traceback)")
 
 
-@pytest.mark.parametrize(
-    "line", ["echelon --debug dbc lab", "echelon dbc --debug lab", "ECHELON_DEBUG=1 echelon dbc lab"]
-)
-def test_the_traceback_is_shown_to_those_who_ask(line: str) -> None:
-    done = run_in_shell(f"{line} > /dev/full", ROOT)
-    assert done.returncode == 3
-    assert done.stderr.startswith("Traceback (most recent call last):")
-    assert done.stderr.splitlines()[-1] == "OSError: [Errno 28] No space left on device"
+@pytest.mark.usefixtures("broken")
+@pytest.mark.parametrize("words", [["--debug", "dbc", "lab"], ["dbc", "--debug", "lab"], ["dbc", "lab"]])
+def test_the_traceback_is_shown_to_those_who_ask(
+    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "--debug" not in words:
+        monkeypatch.setenv("ECHELON_DEBUG", "1")
+    assert main(words) == 3
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "Traceback (most recent call last):"
+    assert lines[-2:] == ["RuntimeError: a mistake", "of ours"]
 
 
 # Completion

@@ -4,10 +4,11 @@ import os
 import re
 import resource
 import signal
+import stat
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from multiprocessing import Process
+from multiprocessing import Process, forkserver, util
 from pathlib import Path
 from subprocess import Popen
 
@@ -20,6 +21,7 @@ from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, encode, join, watch_key
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import parse
+from echelon.sim.processes.children import warm_up
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.failures import NAMED, few
 from echelon.sim.processes.outcome import Outcome, Progress
@@ -184,6 +186,15 @@ def test_two_runs_at_once_never_meet(tmp_path: Path) -> None:
     digests = [summary_of(tmp_path / str(seed))["trace_digest"] for seed in (1, 2)]
     assert digests == [trace_of(plan).digest() for plan in plans]
     assert digests[0] != digests[1]
+
+
+def test_only_this_user_reaches_the_fork_server() -> None:
+    """Its socket is a file in a folder of this user's, also with Python 3.11.0 (CVE-2022-42919)."""
+    warm_up()
+    address = forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
+    assert util.abstract_sockets_supported is False
+    assert stat.S_ISSOCK(os.stat(address).st_mode)
+    assert stat.S_IMODE(Path(address).parent.stat().st_mode) == 0o700
 
 
 class Attacker:

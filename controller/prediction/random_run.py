@@ -201,6 +201,11 @@ def _waits(plan: Plan, random: frozenset[int], chained: frozenset[int]) -> bool:
             "event-driven nodes: losses are computed where all acceleration periods are equal, torque is mirrored, and only "
             'states have delays; with timing = "time_driven" they are computed for all periods and delays'
         )
+    within = any(link.delay_min_ns % link.period_ns for link in plan.links if link.channel is Channel.STATE)
+    if within and not all(robot.event_driven for robot in plan.robots):
+        raise PredictionError(
+            "time-driven robots below event-driven nodes: losses are computed where states are late by whole periods"
+        )
     return True
 
 

@@ -142,6 +142,18 @@ def test_policies_are_those_of_the_mean_over_all_patterns_of_loss(links, monkeyp
     check_patterns(random_plan(((None,), None), 3, timing="time_driven", links=links), monkeypatch)
 
 
+def time_driven_robots(plan: Plan) -> Plan:
+    """Returns the plan with robots that act at their instants alone, below nodes as they are."""
+    return replace(plan, robots=tuple(replace(robot, event_driven=False) for robot in plan.robots))
+
+
+def test_time_driven_robots_below_event_driven_nodes(monkeypatch):
+    plan = time_driven_robots(random_plan(((None,), None), 3, timing="event_driven"))
+    check_patterns(later(plan, Channel.STATE, round(T * 1e9)), monkeypatch)
+    with pytest.raises(PredictionError, match="whole periods"):
+        mean_square(later(plan, Channel.STATE, round(1.5 * T * 1e9)), Channel.STATE)
+
+
 def check_patterns(plan: Plan, patch: pytest.MonkeyPatch) -> None:
     """Holds the second moment against the mean over all patterns of loss in one period.  In the period after it all is lost;
     before and after these two all comes."""

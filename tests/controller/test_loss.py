@@ -11,7 +11,7 @@ import pytest
 
 from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError
-from echelon.controller.prediction.linear_run import LinearRun, later
+from echelon.controller.prediction.linear_run import LinearRun, edge_of, later
 from echelon.controller.prediction.mean_square import Losses, gilbert, mean_square
 from echelon.controller.prediction.random_branches import moment
 from echelon.controller.prediction.random_run import RandomRun
@@ -113,6 +113,16 @@ def test_second_moment_is_the_mean_over_all_patterns_of_loss(tree, timing, broad
     check_patterns(
         replace(plan, links=tuple(replace(link, loss_of_message=broadcast) for link in plan.links)), monkeypatch
     )
+
+
+@pytest.mark.parametrize("timing", ["time_driven", "event_driven"])
+def test_second_moment_where_each_robot_is_late_by_its_own_delay(timing, monkeypatch):
+    # Both states come in the same period, so nothing is known before, as the linear run has it.
+    plan, further = random_plan(((None, None),), 3, timing=timing), iter((1.3, 1.6))
+    for link in plan.links:
+        if link.channel is Channel.STATE:
+            plan = later(plan, frozenset((edge_of(link),)), round(next(further) * T * 1e9))
+    check_patterns(plan, monkeypatch)
 
 
 @pytest.mark.parametrize("timing", ["time_driven", "event_driven"])

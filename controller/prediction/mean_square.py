@@ -50,14 +50,17 @@ class LossBoundary:
     """Spectral radius of L with the largest loss of these links in the plan: E|x|² is multiplied by it in each hyperperiod"""
 
 
-def mean_square(plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float | None = None) -> LossBoundary:
+def mean_square(
+    plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float | None = None, largest: int = LARGEST
+) -> LossBoundary:
     """Returns how many messages links of a plan may lose; other links are as in the plan.  `links` are some of `plan.links`, or
     the channel of all that rules apply to.
 
-    With `burst` they lose messages in bursts of this mean length, none between bursts and all within them (Gilbert).
+    With `burst` they lose messages in bursts of this mean length, none between bursts and all within them (Gilbert).  The time
+    that it takes grows with the third power of the numbers that act on each other; `largest` is how many there may be.
 
     Raises PredictionError if nothing exact can be said of the plan, ValueError if there are no such links."""
-    losses = Losses(plan, places_of(plan, links), burst)
+    losses = Losses(plan, places_of(plan, links), burst, largest)
     at_own = losses.radius(losses.own)
     if losses.gain(0.0) >= 1:
         return LossBoundary(None, "unstable", burst, at_own)
@@ -72,8 +75,9 @@ def mean_square(plan: Plan, links: Sequence[LinkPlan] | Channel, *, burst: float
 class Losses:
     """The linear run of a plan, with the loss of some links as a variable."""
 
-    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None) -> None:
-        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.
+    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None, most: int = LARGEST) -> None:
+        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.  `most` is how many
+        numbers may act on each other.
 
         Raises PredictionError if nothing exact can be said."""
         self._varied, self._burst = sorted(varied), burst
@@ -102,8 +106,11 @@ class Losses:
             lossy, chained = lossy - {*in_bursts}, in_bursts
         self.run = RandomRun(plan, lossy, chained)
         self.parts = self.run.parts()
-        if (largest := max(len(part.registers) for part in self.parts)) > LARGEST:
-            raise PredictionError(f"{largest} numbers act on each other, too many to compute losses with")
+        if (largest := max(len(part.registers) for part in self.parts)) > most:
+            raise PredictionError(
+                f"{largest} numbers act on each other, among them those under way on late links; losses are computed with up "
+                f"to {most}"
+            )
         self._different = different(self.parts, self.chances(ALIKE_AT))
 
     def gain(self, loss: float) -> float:

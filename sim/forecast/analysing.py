@@ -41,6 +41,8 @@ from echelon.sim.results.analysis import (
 
 MOST: Final = 30
 """Largest number of robots for which losses and costs are computed"""
+LARGEST: Final = 250
+"""Most numbers that may act on each other where losses are computed: a few seconds for each set of links"""
 OF_MEMBERS: Final = ("group", "robot")
 Say = Callable[[str, int, int], None]
 """What is being computed, how many parts are done, and how many there are"""
@@ -150,7 +152,7 @@ def _table(plan: Plan, members: bool, say: Say) -> Iterable[LinksResult]:
 def _loss(plan: Plan, edges: Edges) -> LossResult:
     """Returns how many messages of some links may be lost in the mean square."""
     try:
-        found = mean_square(plan, [link for link in plan.links if edge_of(link) in edges])
+        found = mean_square(plan, [link for link in plan.links if edge_of(link) in edges], largest=LARGEST)
     except PredictionError as error:
         return LossResult(None, "not computed", str(error))
     return LossResult(found.loss, found.ends, "")

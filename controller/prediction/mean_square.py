@@ -75,9 +75,9 @@ def mean_square(
 class Losses:
     """The linear run of a plan, with the loss of some links as a variable."""
 
-    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None, most: int = LARGEST) -> None:
-        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.  `most` is how many
-        numbers may act on each other.
+    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None, largest: int = LARGEST) -> None:
+        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.  `largest` is how
+        many numbers may act on each other.
 
         Raises PredictionError if nothing exact can be said."""
         self._varied, self._burst = sorted(varied), burst
@@ -106,10 +106,10 @@ class Losses:
             lossy, chained = lossy - {*in_bursts}, in_bursts
         self.run = RandomRun(plan, lossy, chained)
         self.parts = self.run.parts()
-        if (largest := max(len(part.registers) for part in self.parts)) > most:
+        if (count := max(len(part.registers) for part in self.parts)) > largest:
             raise PredictionError(
-                f"{largest} numbers act on each other, among them those under way on late links; losses are computed with up "
-                f"to {most}"
+                f"{count} numbers act on each other, among them those under way on late links; losses are computed with up "
+                f"to {largest}"
             )
         self._different = different(self.parts, self.chances(ALIKE_AT))
 

@@ -12,6 +12,7 @@ from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.messages import Channel
 from echelon.plan.plan import LinkPlan, Plan
+from echelon.runtime.turns import Turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ def analyse(plan: Plan) -> Analysis:
         _each_once(robot.torque_period_ns for robot in plan.robots),
         run.hyperperiod_ns * 1e-9,
         radius,
-        _centroid_age(plan) if plan.reference == "now" else 0.0,
+        _centroid_age(run) if plan.reference == "now" else 0.0,
     )
 
 
@@ -80,18 +81,33 @@ def describe_untreated(links: Sequence[LinkPlan]) -> str:
     return ", ".join(f"{count} {channel} links {what}" for (channel, what), count in found.items())
 
 
-def _centroid_age(plan: Plan) -> float:
-    """Returns the mean age of the robots' positions when the coordinator uses them [s]."""
-    links = {(link.source, link.receiver): link for link in plan.links if link.channel in _UP}
-    ages = []
-    for robot in plan.robots:
-        member, age_ns, now_ns = robot.index, 0, 0
-        while (parent := plan.formation[member].parent) is not None:
-            link = links[member, parent]
-            used_ns = -(-(now_ns + link.delay_min_ns) // link.period_ns) * link.period_ns
-            age_ns, now_ns, member = used_ns, used_ns, parent
-        ages.append(age_ns)
-    return sum(ages) / len(ages) * 1e-9
+def _centroid_age(run: LinearRun) -> float:
+    """Returns the mean age of the robots' positions when the coordinator uses them [s], by the schedule of the run.
+
+    A node that stands for several alike (`likeness.reduced`) has their weight, so this is the mean over all robots."""
+    plan, H_ns = run.plan, run.hyperperiod_ns
+    periods_ns = {(link.source, link.receiver): link.period_ns for link in plan.links if link.channel in _UP}
+    gathers = {
+        stage.timed.member: (stage.timed.inputs, acts)
+        for stage, acts in zip(run.stages, run.schedule, strict=True)
+        if stage.timed.turn is Turn.GATHER
+    }
+
+    def taken_ns(member: int, due_ns: int) -> float:
+        """Returns the mean instant of the positions in what a member says that is due at an instant."""
+        if member not in gathers:
+            return due_ns
+        inputs, acts = gathers[member]
+        begin_ns = due_ns // H_ns * H_ns
+        (act,) = acts[due_ns - begin_ns]
+        weights = plan.nodes[member - len(plan.robots)].weights
+        return sum(
+            weight * taken_ns(heard.source, begin_ns + number * periods_ns[heard.source, member])
+            for weight, heard, number in zip(weights, inputs, act.used, strict=True)
+        ) / sum(weights)
+
+    (act,) = gathers[plan.root.index][1][0]
+    return (act.after_ns - taken_ns(plan.root.index, 0)) * 1e-9
 
 
 _UP = (Channel.STATE, Channel.GROUP_STATE)

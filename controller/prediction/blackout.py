@@ -11,7 +11,8 @@ import numpy as np
 from echelon.controller.prediction.cost import block_rows, registers_at_rest
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.mean_square import Losses, places_of
-from echelon.controller.prediction.random_steps import Chances, mean
+from echelon.controller.prediction.random_branches import mean
+from echelon.controller.prediction.random_steps import Chances
 from echelon.messages import Channel
 from echelon.plan.plan import Array, LinkPlan, Plan
 
@@ -38,8 +39,13 @@ def blackout(
     """Returns the errors of all blocks in a run of a plan from its start, in which all is lost that is sent on links from
     `at_ns` on for `duration_ns`.  `links` are some of `plan.links`, or the channel of all that rules apply to.
 
-    Raises PredictionError if the plan loses other messages, if links have delays before anything is known, or if nothing exact
-    can be said."""
+    Raises PredictionError if the plan loses other messages, if links have delays, or if nothing exact can be said, ValueError
+    if the blackout does not begin within the run."""
+    if not 0 <= at_ns <= plan.duration_ns or duration_ns < 0:
+        raise ValueError(
+            f"a blackout from {at_ns / 1e9:g} s on for {duration_ns / 1e9:g} s: must begin within the run's "
+            f"{plan.duration_ns / 1e9:g} s, and not be negative"
+        )
     if any(link.loss for link in plan.links):
         raise PredictionError("the plan has losses beside the blackout: its run is random")
     if any(link.delay_max_ns for link in plan.links):

@@ -18,9 +18,12 @@ from typing import Final
 import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
+from echelon.controller.prediction.linear_run import lags
 from echelon.controller.prediction.mean_square import Losses, of_bursts
+from echelon.controller.prediction.random_branches import mean, moment
+from echelon.controller.prediction.random_delays import varies
 from echelon.controller.prediction.random_run import Part
-from echelon.controller.prediction.random_steps import Chances, mean, moment
+from echelon.controller.prediction.random_steps import Chances
 from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
@@ -73,6 +76,10 @@ def expected_cost(plan: Plan) -> Cost | None:
     None if errors do not vanish in the mean square.
 
     Raises PredictionError if nothing exact can be said of the plan."""
+    if lags(plan):
+        raise PredictionError(
+            'with law.reference = "now" and late states errors of a moving formation do not vanish: their cost has no limit'
+        )
     losses = Losses(plan, (), None)
     if losses.gain(0.0) >= 1:
         return None
@@ -136,8 +143,10 @@ def waiting(plan: Plan) -> Array:
     """Returns the probabilities that robots stay at rest for 0, 1, 2, .. hyperperiods: until the coordinator has heard, through
     all nodes between, of every robot.  Until then nodes know nothing to command.
 
-    Raises PredictionError if periods differ and this takes time."""
+    Raises PredictionError if delays on the way up vary, or if periods differ and this takes time."""
     links = {(link.source, link.receiver): link for link in plan.links if link.channel in _UP}
+    if any(map(varies, links.values())):
+        raise PredictionError("the cost of a run from its start is computed for states whose delays do not vary")
     if all(link.ideal for link in links.values()):
         return np.ones(1)
     T_ns = plan.root.period_ns

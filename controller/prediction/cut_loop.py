@@ -20,14 +20,12 @@ SMALL: Final = 150
 """Number of unknowns up to which equations are solved with dense matrices"""
 RANK: Final = 1e-12
 """Singular values below this share of the largest one count as zero"""
-_TOGETHER: Final = 32
+TOGETHER: Final = 32
 """Number of frequencies that are computed at once"""
-
-Complex = NDArray[np.complex128]
-
-
 SLOW: Final = 1e-2
 """Crossings are searched from this multiple of the slowest block's natural frequency upwards"""
+
+Complex = NDArray[np.complex128]
 
 
 def parts(loop: Loop) -> "Iterator[Part]":
@@ -63,7 +61,7 @@ class Part:
 
     def eigenvalues(self, omega: Array) -> Complex:
         """Returns the eigenvalues of R(e^{jω}) at several ω, (m, n)."""
-        some = np.array_split(omega, max(1, len(omega) // _TOGETHER))
+        some = np.array_split(omega, max(1, len(omega) // TOGETHER))
         return np.concatenate([np.linalg.eigvals(self._small(np.exp(1j * each))[0]) for each in some])
 
     def motions(self, crossing: Crossing) -> tuple[NDArray[np.intp], Complex]:

@@ -63,6 +63,13 @@ def untreated(plan: Plan) -> tuple[LinkPlan, ...]:
     return tuple(link for link in plan.links if not link.steady or link.policy in (EXTRAPOLATE, PREDICT))
 
 
+def lags(plan: Plan) -> bool:
+    """Returns whether a moving formation keeps an error that the linear run does not have: late positions are compared with the
+    reference of the present (`law.reference = "now"`)."""
+    up = (Channel.STATE, Channel.GROUP_STATE)
+    return plan.reference == "now" and any(link.delay_max_ns or link.loss for link in plan.links if link.channel in up)
+
+
 def edges_of(plan: Plan, late: Channel | Edges) -> Edges:
     """Returns the links of a channel of `CHANNELS`, or these links themselves."""
     return late if isinstance(late, frozenset) else frozenset(map(edge_of, ruled_links(plan, late)))
@@ -112,11 +119,13 @@ class LinearRun:
         robots = [LinearRobot(plan, robot) for robot in plan.robots]
         nodes = [LinearNode(plan, node) for node in plan.nodes]
         self._roles: list[LinearRobot | LinearNode] = [*robots, *nodes]
-        self._stages = sorted(
+        self.stages = sorted(
             (stage for role in self._roles for stage in role.stages), key=lambda stage: stage.timed.level
         )
-        self._tick_ns = gcd(*(stage.timed.period_ns for stage in self._stages))
-        self._schedule = schedule(plan, [stage.timed for stage in self._stages])
+        """All stages, in the order of their levels"""
+        self._tick_ns = gcd(*(stage.timed.period_ns for stage in self.stages))
+        self.schedule = schedule(plan, [stage.timed for stage in self.stages])
+        """For each stage when it acts, and with which messages"""
         self._places = [0]
         """Where in x the memory of each role begins, and where the last one ends"""
         for role in self._roles:
@@ -127,7 +136,7 @@ class LinearRun:
         """Returns the periods of all stages [ns], or of the stages that use messages of some links."""
         return {
             stage.timed.period_ns
-            for stage in self._stages
+            for stage in self.stages
             if late is None
             or any((heard.source, stage.timed.member, heard.channel) in late for heard in stage.timed.inputs)
         }
@@ -150,7 +159,7 @@ class LinearRun:
         plan = self.plan
         periods = {(link.source, link.channel): link.period_ns for link in plan.links}
         wires: dict[_Key, _Wire] = {}
-        for stage, acts in zip(self._stages, self._schedule, strict=True):
+        for stage, acts in zip(self.stages, self.schedule, strict=True):
             for act in (act for some in acts.values() for act in some):
                 for heard, number in zip(stage.timed.inputs, act.used, strict=True):
                     at = heard.source, heard.channel
@@ -191,7 +200,7 @@ class LinearRun:
         said: dict[tuple[_Wire, int], Array] = {}
 
         for time_ns in range(0, hyperperiod_ns, self._tick_ns):
-            for stage, acts in zip(self._stages, self._schedule, strict=True):
+            for stage, acts in zip(self.stages, self.schedule, strict=True):
                 if time_ns not in acts:
                     continue
                 member = stage.timed.member

@@ -41,11 +41,11 @@ ZERO: Final = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class LyapunovBounds:
-    """Bounds below which every ε_i is stable; None if the layers before are not stable."""
+    """Bounds below which every ε_i is stable: 0 if the layers before are not stable, infinite if no coupling limits it."""
 
-    corrected: float | None
+    corrected: float
     """From the complete Q, the best over d"""
-    by_norms: float | None
+    by_norms: float
     """From norms, as in the paper's appendix"""
     literal: float | None
     """The paper's formula (label be1), the best over d: it proves nothing.  Only for ε_1"""
@@ -81,7 +81,7 @@ def lyapunov_bounds(loop: ErrorDynamics, epsilon: Sequence[float]) -> list[Lyapu
             )
         )
         slow = np.concatenate([slow, fast])
-    return found + [LyapunovBounds(None, None, None)] * (len(epsilon) - len(found))
+    return found + [LyapunovBounds(0.0, 0.0, None)] * (len(epsilon) - len(found))
 
 
 def _needed(log: float, own: Array, PC: Array, CP: Array) -> float:

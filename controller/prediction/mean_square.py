@@ -15,9 +15,10 @@ import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_run import ruled_links
+from echelon.controller.prediction.random_branches import moment
 from echelon.controller.prediction.random_delays import of_delays, varies
 from echelon.controller.prediction.random_run import Part, RandomRun
-from echelon.controller.prediction.random_steps import Chances, moment
+from echelon.controller.prediction.random_steps import Chances
 from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.messages import Channel
 from echelon.plan.delay_tables import Bursts
@@ -46,9 +47,7 @@ class LossBoundary:
     burst: float | None
     """Mean length of the bursts of losses [messages]; None: each message is lost by itself"""
     radius: float
-    """Spectral radius of L at the plan's own mean loss: E|x|² is multiplied by it in each hyperperiod"""
-    estimate: bool = False
-    """True if the boundary is an estimate from random runs; False if it is exact"""
+    """Spectral radius of L with the largest loss of these links in the plan: E|x|² is multiplied by it in each hyperperiod"""
 
 
 def mean_square(
@@ -76,9 +75,9 @@ def mean_square(
 class Losses:
     """The linear run of a plan, with the loss of some links as a variable."""
 
-    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None, most: int = LARGEST) -> None:
-        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.  `most` is how many
-        numbers may act on each other.
+    def __init__(self, plan: Plan, varied: Iterable[int], burst: float | None, largest: int = LARGEST) -> None:
+        """`varied` are places in `plan.links`; with `burst` all of them lose the same messages, in bursts.  `largest` is how
+        many numbers may act on each other.
 
         Raises PredictionError if nothing exact can be said."""
         self._varied, self._burst = sorted(varied), burst
@@ -97,6 +96,7 @@ class Losses:
                 "delays that vary are computed on one link, without losses in bursts and with its own loss"
             )
         check_together(plan, [*in_bursts, *chained])
+        check_broadcasts(plan, frozenset(self._varied))
         self._chain = None
         if varying:
             self._chain = of_delays(plan.links[varying[0]])
@@ -106,10 +106,10 @@ class Losses:
             lossy, chained = lossy - {*in_bursts}, in_bursts
         self.run = RandomRun(plan, lossy, chained)
         self.parts = self.run.parts()
-        if (largest := max(len(part.registers) for part in self.parts)) > most:
+        if (count := max(len(part.registers) for part in self.parts)) > largest:
             raise PredictionError(
-                f"{largest} numbers act on each other, among them those under way on late links; losses are computed with up "
-                f"to {most}"
+                f"{count} numbers act on each other, among them those under way on late links; losses are computed with up "
+                f"to {largest}"
             )
         self._different = different(self.parts, self.chances(ALIKE_AT))
 
@@ -128,6 +128,19 @@ class Losses:
         losses = self._others.copy()
         losses[self._varied] = loss
         return Chances.of(losses, self._chain)
+
+
+def check_broadcasts(plan: Plan, varied: frozenset[int]) -> None:
+    """Raises PredictionError if a message that is lost for all receivers at once would be lost with different probabilities."""
+    losses: dict[tuple[int, Channel], set[float | None]] = {}
+    for at, link in enumerate(plan.links):
+        if link.loss_of_message:
+            losses.setdefault((link.source, link.channel), set()).add(None if at in varied else link.loss)
+    for (_, channel), found in losses.items():
+        if len(found) > 1:
+            raise PredictionError(
+                f"{channel.name.lower()} messages are lost for all receivers at once: all their links must have the same loss"
+            )
 
 
 def check_together(plan: Plan, chained: Sequence[int]) -> None:

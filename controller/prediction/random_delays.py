@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
+from echelon.messages import Channel
 from echelon.plan.delay_tables import BITS, DelayTrace, looked_up
 from echelon.plan.plan import Array, LinkPlan, Plan
 
@@ -37,6 +38,8 @@ def check_delays(plan: Plan, link: LinkPlan) -> None:
     """Raises PredictionError if the varying delays of a link cannot be treated exactly."""
     if any(node.event_driven for node in plan.nodes) or len({each.period_ns for each in plan.formation}) > 1:
         raise PredictionError("delays that vary are computed for time-driven nodes with equal periods")
+    if link.channel is Channel.COMMAND and plan.robots[link.receiver].event_driven:
+        raise PredictionError("commands whose delays vary are computed for time-driven robots")
     if isinstance(link.delays, DelayTrace) or link.fifo or link.duplicates or link.bursts or link.policy != "hold":
         raise PredictionError(
             "delays that vary are computed for independent delays, policy hold, without order and duplicates"

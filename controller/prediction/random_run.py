@@ -22,8 +22,9 @@ from scipy.sparse.csgraph import connected_components
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_roles import LinearStage
 from echelon.controller.prediction.policies import check_policy
+from echelon.controller.prediction.random_branches import Either, Window, forced, needs
 from echelon.controller.prediction.random_delays import check_delays, varies
-from echelon.controller.prediction.random_steps import Either, Indices, Linear, Step, Window, forced, needs
+from echelon.controller.prediction.random_steps import Indices, Linear, Step
 from echelon.controller.prediction.registers import Registers, Role, Taking
 from echelon.messages import Channel
 from echelon.plan.layout import with_message_sizes
@@ -89,11 +90,7 @@ class RandomRun:
         rising = [pair for pair in self.registers.stages() if pair[1].timed.turn in (Turn.SAY, Turn.GATHER)]
         up, came = (
             tuple(
-                step
-                for level in _levels(rising)
-                for step in self.registers.acts(
-                    level, wait_ns if level[0][1].timed.turn is Turn.GATHER else 0, came=only
-                )
+                step for level in _levels(rising) for step in self.registers.acts(level, 0, wait_ns=wait_ns, came=only)
             )
             for only in (False, True)
         )
@@ -203,6 +200,11 @@ def _waits(plan: Plan, random: frozenset[int], chained: frozenset[int]) -> bool:
         raise PredictionError(
             "event-driven nodes: losses are computed where all acceleration periods are equal, torque is mirrored, and only "
             'states have delays; with timing = "time_driven" they are computed for all periods and delays'
+        )
+    within = any(link.delay_min_ns % link.period_ns for link in plan.links if link.channel is Channel.STATE)
+    if within and not all(robot.event_driven for robot in plan.robots):
+        raise PredictionError(
+            "time-driven robots below event-driven nodes: losses are computed where states are late by whole periods"
         )
     return True
 

@@ -91,18 +91,21 @@ class Registers:
         longest = max(-(wire.first // wire.per_hyperperiod) for wire in self._wires.values())
         return (1 + longest) * (1 + max(node.depth for node in self.plan.nodes))
 
-    def acts(self, pairs: Sequence[tuple[Role, LinearStage]], time_ns: int, *, came: bool = False) -> list[Step]:
-        """Returns the steps of stages of one level that are due at an instant, with what has come by then.  `came`: as far as
-        all messages come."""
+    def acts(
+        self, pairs: Sequence[tuple[Role, LinearStage]], time_ns: int, *, wait_ns: int = 0, came: bool = False
+    ) -> list[Step]:
+        """Returns the steps of stages of one level that are due at an instant, with what has come `wait_ns` later.  `came`: as
+        far as all messages come."""
+        now_ns = time_ns + wait_ns
         takings = [
-            Taking(stage.timed.member, heard, time_ns - stage.timed.period_ns, time_ns)
+            Taking(stage.timed.member, heard, now_ns - stage.timed.period_ns, now_ns)
             for _, stage in pairs
             for heard in stage.timed.inputs
         ]
         return [*self.take(takings, came=came), self.run(pairs, time_ns)]
 
     def run(self, pairs: Sequence[tuple[Role, LinearStage]], time_ns: int) -> Linear:
-        """Returns the step of stages of one level, with the messages in use."""
+        """Returns the step of stages of one level that are due at an instant, with the messages in use."""
         return self._linear([block for role, stage in pairs for block in self._blocks(role, stage, time_ns)])
 
     def move(self, robots: Iterable[int], span_ns: int) -> Linear:

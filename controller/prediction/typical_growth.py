@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from echelon.controller.prediction.mean_square import Losses, places_of
-from echelon.controller.prediction.random_steps import sample
+from echelon.controller.prediction.random_branches import sample
 from echelon.messages import Channel
 from echelon.plan.plan import LinkPlan, Plan
 

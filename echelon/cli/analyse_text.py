@@ -92,10 +92,9 @@ def _scales(found: "AnalysisResult") -> list[str]:
         head = ("ε", "now", "sampled from", "to", "exact", "of its layers", "bound", "by norms", "paper's formula")
         rows = []
         for at, one in enumerate(found.epsilon, 1):
-            low, high = (_number(value, none) for value, none in ((one.sampled_low, "any"), (one.sampled_high, "any")))
-            exact = [_number(value, "any") for value in (one.exact, one.exact_of_layers)]
-            bounds = [_number(value, "any" if not one.coupled else "none") for value in (one.bound, one.bound_by_norms)]
-            rows.append((f"ε{at}", f"{one.value:g}", low, high, *exact, *bounds, _number(one.paper_formula, "")))
+            low, high = (_number(each, "any") for each in (one.sampled_low, one.sampled_high))
+            rest = [_bound(each) for each in (one.exact, one.exact_of_layers, one.bound, one.bound_by_norms)]
+            rows.append((f"ε{at}", f"{one.value:g}", low, high, *rest, _number(one.paper_formula, "")))
         lines += [
             "",
             "  ε for which the formation is stable, the others as they are: with these periods and links; in continuous time, "
@@ -155,8 +154,7 @@ def _loss(found: "LossResult | None") -> str:
         return "?"
     if found.share is None:
         return "none"
-    about = "about " if found.estimate else "over " if found.ends == "limit" else ""
-    return f"{about}{100 * found.share:.3g} %"
+    return f"{'over ' if found.ends == 'limit' else ''}{100 * found.share:.3g} %"
 
 
 def _named(one: "LinksResult") -> str:
@@ -166,6 +164,10 @@ def _named(one: "LinksResult") -> str:
 def _counted(names: Sequence[str]) -> str:
     """Returns names as a list; of many the first and their number."""
     return f"{names[0]} and {len(names) - 1} more" if len(names) > NAMES else _enumeration(names)
+
+
+def _bound(value: float | None) -> str:
+    return "none" if value == 0 else _number(value, "any")
 
 
 def _number(value: float | None, none: str) -> str:

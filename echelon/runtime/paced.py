@@ -2,7 +2,7 @@
 
 A stage runs in Zenoh's thread, with the message that completes its inputs.  The main thread wakes at each instant and each
 deadline.  A stage whose deadline has come runs with the newest messages that have come, and is counted as late if one was
-missing (`echelon.runtime.mailbox.WallMailbox`).
+missing (`echelon.runtime.wall_mailbox`).
 
 In run time a stage acts in the instant in which the message arrives that completes its inputs, or at its deadline, even if the
 process gets to it later.  So what it takes to compute is part of the time that its messages take.
@@ -14,9 +14,9 @@ from echelon.messages import Message
 from echelon.plan.plan import Plan
 from echelon.role import Acts, Role, Stage
 from echelon.runtime.arrivals import END, FLUSH_NS, ArrivalFile, pack_arrival
-from echelon.runtime.mailbox import WallMailbox, allowed_ns
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
+from echelon.runtime.wall_mailbox import WallMailbox, allowed_ns
 
 
 class PacedRunner(Runner):

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf, isfinite
 from typing import Final
 
-from echelon.controller.prediction.analysis import Analysis, analyse
+from echelon.controller.prediction.analysis import analyse
 from echelon.controller.prediction.block_margin import delay_margin
 from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError, linear_gains
@@ -73,7 +73,9 @@ def analysis_of(
     skipped: list[str] = []
     table = tuple(_table(plan, members, say)) if found.settles else ()
     say("ε and couplings", 0, 1)
-    epsilons, coupling = _time_scales(plan, time_scales, epsilon, found, skipped)
+    blocks = tuple(_modes(plan))
+    is_stable_alone = all(one.poles[0][0] < 0 for one in blocks)
+    epsilons, coupling = _time_scales(plan, time_scales, epsilon, is_stable_alone, found.settles, skipped)
     return AnalysisResult(
         scenario=plan.name,
         assumptions=_assumptions(plan),
@@ -86,7 +88,7 @@ def analysis_of(
         spectral_radius=found.radius,
         time_constant=_finite(found.time_constant),
         centroid_age=found.centroid_age,
-        blocks=tuple(_modes(plan)),
+        blocks=blocks,
         settling=tuple(SettlingResult(one.block, one.band, one.settled) for one in predicted_settling(plan)),
         table=table,
         epsilon=epsilons,
@@ -120,11 +122,13 @@ def scaled_delays(plan: Plan, time_scales: str, epsilon: Sequence[float], say: S
 
 def _assumptions(plan: Plan) -> tuple[str, ...]:
     bus = ("bus and drives take no time",) if plan.can.closed else ()
+    events = ("blackouts of links are left out",) if any(link.blackouts for link in plan.links) else ()
     return (
         "robots follow the desired accelerations exactly",
         "no limit acts",
         "avoidance does not act",
         *bus,
+        *events,
         "the delays are constant, and beyond those of the scenario",
     )
 
@@ -141,7 +145,7 @@ def _table(plan: Plan, members: bool, say: Say) -> Iterable[LinksResult]:
         loss = None
         if one.kind == "class":
             why = f"only computed for up to {MOST} robots, here are {count}" if count > MOST else ""
-            loss = LossResult(None, "not computed", False, why) if why else _loss(plan, one.edges)
+            loss = LossResult(None, "not computed", why) if why else _loss(plan, one.edges)
         yield _links(one, known[one.edges], loss)
 
 
@@ -150,8 +154,8 @@ def _loss(plan: Plan, edges: Edges) -> LossResult:
     try:
         found = mean_square(plan, [link for link in plan.links if edge_of(link) in edges], largest=LARGEST)
     except PredictionError as error:
-        return LossResult(None, "not computed", False, str(error))
-    return LossResult(found.loss, found.ends, found.estimate, "")
+        return LossResult(None, "not computed", str(error))
+    return LossResult(found.loss, found.ends, "")
 
 
 def _links(one: LinkSet, found: LargestDelay, loss: LossResult | None = None) -> LinksResult:
@@ -193,9 +197,11 @@ def _cost_shares(plan: Plan) -> dict[str, float]:
 
 
 def _time_scales(
-    plan: Plan, time_scales: str, epsilon: Sequence[float], found: Analysis, skipped: list[str]
+    plan: Plan, time_scales: str, epsilon: Sequence[float], is_stable_alone: bool, settles: bool, skipped: list[str]
 ) -> tuple[tuple[EpsilonResult, ...], CouplingResult | None]:
-    """Returns how far ε and couplings may go; adds to `skipped` what is not computed."""
+    """Returns how far ε and couplings may go; adds to `skipped` what is not computed.
+
+    `is_stable_alone`: each block is, in continuous time; then every ε is where nothing is coupled."""
     counts = epsilon_counts(plan, time_scales)
     try:
         loop = None if not plan.coupled else error_dynamics(plan, counts)
@@ -205,16 +211,16 @@ def _time_scales(
     bounds = None if loop is None else lyapunov_bounds(loop, epsilon)
     epsilons = []
     for at, value in enumerate(epsilon):
-        low, high = epsilon_range(plan, counts, epsilon, at + 1) if found.settles else (0.0, 0.0)
-        sampled = (low or None, _finite(high) or None)
+        low, high = epsilon_range(plan, counts, epsilon, at + 1) if settles else (0.0, inf)
+        sampled = (low or None, _finite(high))
         if loop is None or bounds is None:
-            epsilons.append(EpsilonResult(value, False, None, None, None, None, None, *sampled))
+            uncoupled = None if is_stable_alone else 0.0
+            epsilons.append(EpsilonResult(value, *(uncoupled,) * 4, None, *sampled))
             continue
         layers = loop.up_to(at + 1)
         epsilons.append(
             EpsilonResult(
                 value,
-                True,
                 _finite(largest_epsilon(loop, epsilon, at + 1)),
                 _finite(largest_epsilon(layers, epsilon, at + 1)),
                 _finite(bounds[at].corrected),
@@ -225,7 +231,7 @@ def _time_scales(
         )
     if loop is None:
         return tuple(epsilons), None
-    sampled_limit = coupling_limit(plan) if found.settles else inf
+    sampled_limit = coupling_limit(plan) if settles else inf
     return tuple(epsilons), CouplingResult(_finite(largest_coupling(loop)), _finite(sampled_limit))
 
 

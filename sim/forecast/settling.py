@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from echelon.controller.prediction.linear_run import lags
 from echelon.controller.prediction.modes import MOST, linear_errors
 from echelon.plan.plan import Plan
 from echelon.sim.results.block_series import BlockSeries
@@ -26,10 +27,11 @@ class PredictedSettling:
 
 
 def predicted_settling(plan: Plan) -> tuple[PredictedSettling, ...]:
-    """Returns when the error of each block settles; empty for more than `MOST` robots.
+    """Returns when the error of each block settles; empty for more than `MOST` robots, and where a moving formation lags
+    (`linear_run.lags`).
 
     Raises PredictionError as `LinearRun` does."""
-    if len(plan.robots) > MOST:
+    if len(plan.robots) > MOST or lags(plan):
         return ()
     times_ns, errors = linear_errors(plan)
     found = []

@@ -19,7 +19,8 @@ import numpy as np
 from echelon.messages import NULL, Channel, Message
 from echelon.plan.plan import LinkPlan, Plan
 from echelon.role import Role, Stage
-from echelon.runtime.mailbox import Act, Mailbox, WallMailbox, allowed_ns
+from echelon.runtime.mailbox import Act, Mailbox
+from echelon.runtime.wall_mailbox import WallMailbox, allowed_ns
 from echelon.sim.engines.in_process import make_role
 from echelon.sim.results.arrivals import Arrivals
 from echelon.sim.results.recorded import Recorded, Series

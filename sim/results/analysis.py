@@ -34,8 +34,6 @@ class LossResult:
     """Largest share of lost messages; None: unstable even without loss, or not computed"""
     ends: str
     """`unstable`: with a larger share the mean square grows; `limit`: larger shares were not tried; `not computed`"""
-    estimate: bool
-    """True: estimated from random runs, not computed"""
     why: str
     """Why it is not computed; empty if it is"""
 
@@ -114,13 +112,10 @@ class SettlingResult:
 
 @dataclass(frozen=True, slots=True)
 class EpsilonResult:
-    """How large one of `law.epsilon` may be, the others as they are.  None: infinite, if `coupled` is False; else there is none
-    that is stable, or no such bound."""
+    """How large one of `law.epsilon` may be, the others as they are.  None: infinite; 0: none is stable, or none is proved."""
 
     value: float
     """ε in the scenario"""
-    coupled: bool
-    """True if blocks that contain this ε are coupled; otherwise every ε is stable in continuous time"""
     exact: float | None
     """Every ε up to this is stable in continuous time: the whole loop"""
     exact_of_layers: float | None
@@ -130,11 +125,13 @@ class EpsilonResult:
     bound_by_norms: float | None
     """The bound by norms of the paper's appendix"""
     paper_formula: float | None
-    """The paper's formula (label be1) as it is printed, for ε_1: it proves nothing"""
+    """The paper's formula (label be1) as it is printed, for ε_1 where blocks are coupled: it proves nothing.  None: there is no
+    such number"""
     sampled_low: float | None
-    """Smallest ε with which the run is stable with its periods and links"""
+    """Smallest ε with which the run is stable with its periods and links; None if it is down to a thousandth of the present
+    one, or if the run does not settle as it is"""
     sampled_high: float | None
-    """Largest ε with which it is; None if it is up to 1000 times the present one"""
+    """Largest ε with which it is; None if it is up to 1000 times the present one, or if the run does not settle as it is"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +141,7 @@ class CouplingResult:
     exact: float | None
     """In continuous time"""
     sampled: float | None
-    """With the periods and links of the scenario"""
+    """With the periods and links of the scenario; None also if it does not settle"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +192,7 @@ class AnalysisResult:
     blocks: tuple[ModesResult, ...]
     """Modes of the blocks"""
     settling: tuple[SettlingResult, ...]
-    """Predicted settling; empty for more than 200 robots"""
+    """Predicted settling; empty for more than 200 robots, and where `law.reference = "now"` and states are late"""
     table: tuple[LinksResult, ...]
     """What links bear; empty if the scenario does not settle"""
     epsilon: tuple[EpsilonResult, ...]

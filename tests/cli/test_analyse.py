@@ -124,6 +124,14 @@ def test_analyse_puts_the_boundary_of_the_paper_between_six_and_seven_millisecon
     assert [one.message for one in Draft202012Validator(strict(analysis_schema())).iter_errors(facts)] == []
 
 
+def test_an_epsilon_that_no_coupling_limits_may_be_any() -> None:
+    coupling = 'law.coupling=[{block="inter",onto="centroid",value=0.3},{block="centroid",onto="inter",value=0.3}]'
+    done = echelon("analyse", "paper", "--set", coupling)
+    first, second = (line.split() for line in done.stdout.splitlines() if line.split()[:1] in (["ε1"], ["ε2"]))
+    assert float(first[6]) == pytest.approx(0.3096, rel=1e-3)
+    assert second[4:] == ["any"] * 4
+
+
 def test_delays_of_links_are_taken_and_what_is_said_is_what_happens() -> None:
     """With a delay of 0.2 s on every link neither prediction nor run settles; with half of that both do."""
     text = scenario_text("new", sizes("2x3"), None)

@@ -59,6 +59,11 @@ def test_blackouts_of_plans_that_are_random_are_refused():
         blackout(near_formation([{"channel": "state", "loss": 0.1}]), Channel.STATE, 0, 1)
 
 
+def test_blackouts_after_the_run_are_a_mistake():
+    with pytest.raises(ValueError, match="must begin within the run"):
+        blackout(near_formation([], duration=6.0), Channel.STATE, 7_000_000_000, 1)
+
+
 @pytest.mark.parametrize("channel", [Channel.STATE, Channel.COMMAND])
 def test_holding_bears_the_same_delay_by_both_ways_to_make_the_map(channel):
     plan = time_driven(near_formation([]))

@@ -16,8 +16,9 @@ from echelon.plan.delay_tables import ClockPlan
 from echelon.plan.plan import LinkPlan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.arrivals import RECORD
-from echelon.runtime.mailbox import Mailbox, WallMailbox
+from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.turns import Turn
+from echelon.runtime.wall_mailbox import WallMailbox
 from support.links import PunctualLink
 
 PERIOD = 10

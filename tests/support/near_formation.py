@@ -13,13 +13,15 @@ T = 0.025
 TREE = ((None, None), (None, None, None))
 
 
-def near_formation(links: list[dict[str, object]], timing: str = "event_driven", duration: float = 16.0) -> Plan:
+def near_formation(
+    links: list[dict[str, object]], timing: str = "event_driven", duration: float = 16.0, reference: str = "message"
+) -> Plan:
     """Returns robots of the paper's plant, 0.3 m from a formation that drives straight on."""
     table = scenario(
         TREE,
         np.random.default_rng(4),
         duration=duration,
-        law={"epsilon": [0.5, 0.5], "lead": 0.5},
+        law={"epsilon": [0.5, 0.5], "lead": 0.5, "reference": reference},
         periods={"acceleration": T, "torque": T / 2},
         trajectory={"kind": "line", "velocity": (0.5, 0.0)},
         timing=timing,

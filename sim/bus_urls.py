@@ -2,19 +2,26 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
-from echelon.bridge.can.bus_url import interface_is_up, resolve_url
+from echelon.bridge.can.bus_url import interface_is_up, resolve_url, why_no_multicast
 from echelon.errors import UsageError
 from echelon.plan.can_plan import DISTURBANCES
 from echelon.plan.plan import Plan
+
+NO_MULTICAST: Final = "multicast cannot be used here"
+ADVICE: Final = "sudo ip link set lo multicast on; sudo ip route add 224.0.0.0/4 dev lo"
 
 
 def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ...]:
     """Returns the full URL of each bus of the plan, in its order; empty if the run makes no frames.
 
+    If nobody named a bus, and this machine has none that several processes could share, a run whose frames only mirror torques
+    makes none.
+
     `wanted` is the value of `--can`: one URL for all buses, or one for each with commas between; `none`: no frames; None: what
     the scenario says.  `one_process` says that all roles run in one process.  Raises UsageError if the number of URLs does not
-    fit, two buses have the same URL, a URL is not known, or a network interface is not there."""
+    fit, two buses have the same URL, a URL is not known, a network interface is not there, or a closed torque path has no bus."""
     if wanted == "none" or not (plan.can.enabled or wanted):
         return ()
     urls = [bus.url for bus in plan.can.buses]
@@ -27,6 +34,13 @@ def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ..
     if one_process:  # it needs no bus that others can use, unless `wanted` or the scenario names one
         urls = [f"virtual:{bus.name}" if url == "auto" else url for url, bus in zip(urls, plan.can.buses, strict=True)]
     resolved = tuple(_checked_bus(url, number) for number, url in enumerate(urls))
+    by_default = [chosen for url, chosen in zip(urls, resolved, strict=True) if url == "auto"]
+    if wanted is None and any(url.startswith("udp_multicast") for url in by_default) and (why := why_no_multicast()):
+        if plan.can.closed:
+            raise UsageError(
+                f"the closed torque path needs a bus: no vcan0 is up, and {NO_MULTICAST}: {why} ({ADVICE})"
+            )
+        return ()
     if len(set(resolved)) < len(resolved):
         raise UsageError(f"--can {wanted or ','.join(urls)}: two buses have the same URL")
     return resolved

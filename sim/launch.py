@@ -12,7 +12,7 @@ from typing import Literal
 from echelon.errors import UsageError, UserError
 from echelon.plan.plan import Plan
 from echelon.scenario.tables import Scenario
-from echelon.sim.bus_urls import bus_urls, check_wall_clock
+from echelon.sim.bus_urls import NO_MULTICAST, bus_urls, check_wall_clock
 from echelon.sim.finished_run import Run
 from echelon.sim.out_folder import REPORT, OutFolder, out_folder, run_files
 from echelon.sim.processes.children import warm_up
@@ -79,6 +79,8 @@ def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, 
     display = Display(plan, quiet=options.quiet)
     if not options.quiet:
         display.say(_heading(plan, options, folder.path, urls))
+    if not urls and options.can is None and plan.can.enabled:
+        display.say(f"no CAN frames: no vcan0 is up, and {NO_MULTICAST}")
     if folder.stays:
         display.say(f"{folder.path}: holds files of other runs, which stay: {some(folder.stays)}")
     try:

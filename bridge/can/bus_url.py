@@ -51,6 +51,20 @@ def resolve_url(url: str, number: int = 0) -> str:
     return str(parse(url))
 
 
+def why_no_multicast(group: str = DEFAULT_GROUP) -> str | None:
+    """Returns why this machine cannot join an IPv4 multicast group, for example because no network is up; None if it can."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.setsockopt(
+                socket.IPPROTO_IP,
+                socket.IP_ADD_MEMBERSHIP,
+                socket.inet_aton(group) + struct.pack("@I", socket.INADDR_ANY),
+            )
+        except OSError as error:
+            return error.strerror
+    return None
+
+
 def listen_command(url: str) -> str:
     """Returns the command that shows the frames of a bus, or "" for a bus inside one process.
 

@@ -13,6 +13,7 @@ from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
 from echelon.plan.plan import Plan
 from echelon.shipped import FOLDER
+from echelon.sim.bus_urls import ADVICE
 from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
 
 SHORT_QUEUE: Final = 100
@@ -62,7 +63,7 @@ def _output(program: str, *arguments: str) -> str | None:
 def check_multicast() -> Diagnosis:
     """Checks that a frame gets through over multicast, which runs use without vcan0."""
     url = resolve_url("udp_multicast:") if interface_is_up("vcan0") else resolve_url("auto")
-    advice = ("sudo ip link set lo multicast on; sudo ip route add 224.0.0.0/4 dev lo",)
+    advice = (ADVICE,)
     try:
         with open_bus(url) as sender, open_bus(url) as receiver:
             begun_s = time.perf_counter()

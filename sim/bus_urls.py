@@ -21,7 +21,7 @@ def bus_urls(plan: Plan, wanted: str | None, one_process: bool) -> tuple[str, ..
 
     `wanted` is the value of `--can`: one URL for all buses, or one for each with commas between; `none`: no frames; None: what
     the scenario says.  `one_process` says that all roles run in one process.  Raises UsageError if the number of URLs does not
-    fit, two buses have the same URL, a URL is not known, a network interface is not there, or a closed torque path has no bus."""
+    fit, two buses have the same URL, a URL is not known, a network interface is not there, or a closed path has no bus."""
     if wanted == "none" or not (plan.can.enabled or wanted):
         return ()
     urls = [bus.url for bus in plan.can.buses]

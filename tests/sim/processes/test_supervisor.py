@@ -207,11 +207,12 @@ class Attacker:
         self._connect = [endpoint for spec in specs for endpoint in spec.listen]
         self.heard: list[bytes] = []
         self.forged = 0
-        self._done = threading.Event()
+        self._begun, self._done = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._attack)
 
     def __enter__(self) -> "Attacker":
         self._thread.start()
+        assert self._begun.wait(60)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -234,11 +235,12 @@ class Attacker:
                 said.put(payload)
                 copied.put(join([payload]))
                 self.forged += 1
+                self._begun.set()
 
 
 @pytest.mark.parametrize("virtual", [True, False])
 def test_a_program_without_the_secrets_of_a_run_hears_and_changes_nothing(tmp_path: Path, virtual: bool) -> None:
-    plan = plan_of("lab", "duration=2.0")
+    plan = plan_of("lab", f"duration={10.0 if virtual else 2.0}")
     supervisor = Supervisor(plan, tmp_path, run=f"attacked-{os.getpid()}", virtual=virtual)
     with Attacker(supervisor, plan) as attacker:
         outcome = supervisor.run()

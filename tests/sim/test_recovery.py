@@ -53,7 +53,7 @@ def test_what_was_killed_is_rebuilt_in_place(left: Path, tmp_path: Path) -> None
     shutil.copytree(left, folder)
     cut = (folder / "run.mcap").read_bytes()
     with pytest.raises(CutError):
-        read_trace(folder / "run.mcap", plan_of("lab"))
+        read_trace(folder / "run.mcap", plan_of("lab", "duration=3000.0"))
     for command in ("report", "export"):
         refused = echelon(command, folder)
         assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)

@@ -101,6 +101,8 @@ def test_a_killed_search_goes_on_to_the_same_boundary(tmp_path: Path) -> None:
 
 def test_ctrl_c_leaves_the_finished_rows_and_says_how_to_go_on(tmp_path: Path) -> None:
     interrupt = kill_after(3, False).replace("SIGKILL", "SIGINT")
+    # a shell starts what it runs in the background with SIGINT ignored
+    interrupt += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     asked = (
         "lab",
         *QUICK,

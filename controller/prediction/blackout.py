@@ -56,6 +56,14 @@ def blackout(
     steps = plan.duration_ns // run.hyperperiod_ns
     if any(link.period_ns != run.hyperperiod_ns for link in (plan.links[at] for at in places)):
         raise PredictionError("blackouts are computed where the links have the period of the coordinator")
+    channels = {plan.links[at].channel for at in places}
+    whole = at_ns % run.hyperperiod_ns == duration_ns % run.hyperperiod_ns == 0
+    if len(channels) > 1 and not whole and any(node.event_driven for node in plan.nodes):
+        # a node that waits for what was lost acts at the end of its period, when the blackout may be over
+        raise PredictionError(
+            "a blackout of several channels is computed for event-driven nodes where it begins and ends at multiples of the "
+            "coordinator's period"
+        )
     x = registers_at_rest(losses, 0)[None, :, None]
     rows = block_rows(plan, losses)
     found = np.empty((steps + 1, len(rows)))

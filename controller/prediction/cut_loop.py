@@ -28,7 +28,7 @@ SLOW: Final = 1e-2
 Complex = NDArray[np.complex128]
 
 
-def parts(loop: Loop) -> "Iterator[Part]":
+def parts(loop: Loop) -> "Iterator[LoopPart]":
     """Yields the parts of a loop whose variables act on each other.  Equal parts are yielded once."""
     size = loop.A.shape[0]
     seen = set()
@@ -38,10 +38,10 @@ def parts(loop: Loop) -> "Iterator[Part]":
         known = tuple(matrix.toarray().tobytes() for matrix in (part.A, part.B, part.C, part.D))
         if part.B.nnz + part.D.nnz and known not in seen:
             seen.add(known)
-            yield Part(part, x)
+            yield LoopPart(part, x)
 
 
-class Part:
+class LoopPart:
     """A part of a loop: R(z) = C (z - A)⁻¹ B + D.
 
     The messages that receivers get act through few combinations, (B; D) = F V with a V of few rows.  So R has the eigenvalues
@@ -86,7 +86,7 @@ class Cut:
 
     def __init__(self, run: LinearRun, late: Edges, window: tuple[float, float] | None) -> None:
         self._run, self._late, self._window = run, late, window
-        self._crossings: list[tuple[Part, Crossing]] = []
+        self._crossings: list[tuple[LoopPart, Crossing]] = []
 
     @cached_property
     def is_stable(self) -> bool:

@@ -157,7 +157,7 @@ times counted from the start of this command.""",
             "echelon drives lab --set robot.drive.protocol=odrive --can socketcan:vcan0": "nine robots with ODrives",
             "echelon drives lab --seconds 1.0 --json": "for scripts",
         },
-        codes={0: "ended, by Ctrl-C or by --seconds"},
+        codes={0: "ended, by Ctrl-C or by --seconds", 141: "nobody reads it any more"},
     ),
     Command(
         name="can",
@@ -173,7 +173,7 @@ folder of a run it reads can.log: it shows how the run ended, or follows a run t
             "echelon can runs/demo": "how a run ended, or a run that goes on",
             "echelon can runs/demo --speed 10.0 --json": "a run ten times as fast, an object every second",
         },
-        codes={0: "shown"},
+        codes={0: "shown", 141: "nobody reads it any more"},
     ),
     Command(
         name="referee",

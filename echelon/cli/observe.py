@@ -71,6 +71,6 @@ never write.  Who reads too slowly misses messages; the run does not wait.""",
             "echelon observe runs/mine": "all messages of the run in runs/mine",
             "echelon observe runs/mine --under g1 --channel state --json": "states of group g1, for a script",
         },
-        codes={0: "the run is over", 1: "not used"},
+        codes={0: "the run is over", 141: "nobody reads it any more"},
     ),
 )

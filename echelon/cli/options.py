@@ -33,7 +33,7 @@ class Command(Generic[Options]):
     examples: Mapping[str, str]
     """Command lines that can be typed as they are, each with its purpose"""
     codes: Mapping[int, str]
-    """Meanings of the exit codes 0 and 1; also of 2 or 3 if there is more to say than for all commands"""
+    """Meanings of the exit codes 0 and 1, and of others if there is more to say than for all commands"""
     live: bool = False
     """It prints until it is stopped, and ends when nobody reads that any more"""
 

@@ -43,8 +43,9 @@ class Output:
     def _give_up(self, error: OSError) -> None:
         self.trouble = error
         try:
-            # what is buffered would be written again when the interpreter ends
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            with open(os.devnull, "w", encoding="utf-8") as nowhere:
+                # what is buffered would be written again when the interpreter ends
+                os.dup2(nowhere.fileno(), self._stream.fileno())
         except OSError:
             pass
         if self.live and isinstance(error, BrokenPipeError):

@@ -54,8 +54,9 @@ class SweepOptions:
             "KEY=LO:HI:STEP",
         ),
     )
-    share: float = field(
-        default=0.9, metadata=option("share of its runs that must hold for a point of the search to hold", "P")
+    share: float | None = field(
+        default=None,
+        metadata=option("with --find: share of its runs that must hold for a point to hold (default: 0.9)", "P"),
     )
     seeds: int | None = field(
         default=None,
@@ -127,7 +128,7 @@ def sweep(options: SweepOptions) -> int:
 
 def _request(options: SweepOptions) -> "Request":
     from echelon.sim.sweep.folder import resumed
-    from echelon.sim.sweep.preparing import Request
+    from echelon.sim.sweep.preparing import SHARE, Request
     from echelon.sim.sweep.search import Search
     from echelon.sim.sweep.values import parse_vary
 
@@ -151,6 +152,8 @@ def _request(options: SweepOptions) -> "Request":
     chosen = [name for name, is_given in kinds.items() if is_given]
     if len(chosen) > 1:
         raise UsageError(f"--{' and --'.join(chosen)}: only one design can be given")
+    if options.share is not None and options.find is None:
+        raise UsageError("--share: is for a search; give --find too")
     samples = options.random if options.random is not None else options.sobol
     return Request(
         origin=_origin(options.scenario, options.overrides),
@@ -158,7 +161,7 @@ def _request(options: SweepOptions) -> "Request":
         kind=chosen[0] if chosen else "grid",  # type: ignore[arg-type]
         samples=samples or 0,
         search=None if options.find is None else Search.parse(options.find),
-        share=options.share,
+        share=SHARE if options.share is None else options.share,
         seeds=options.seeds,
         engine=options.engine,
         allow_unstable=options.allow_unstable,

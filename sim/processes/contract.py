@@ -27,6 +27,9 @@ from echelon.sim.observing import Gate
 from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Ready, Report
 
+FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
+"""Kinds of processes that get the order to finish, in this order.  Bridge and drives in lockstep do not need it: they are
+members and end with the run."""
 READY_TIMEOUT_S: Final = 20.0
 """How long a process waits for its peers [s]"""
 

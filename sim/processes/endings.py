@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from echelon.bridge.reports import CanReport
-from echelon.sim.processes.children import FINISHING, Child, last_words_of
+from echelon.sim.processes.children import Child, last_words_of
+from echelon.sim.processes.contract import FINISHING
 from echelon.sim.processes.failures import DivergedError, RunError
 from echelon.sim.processes.stalls import STALL_REPORT_S
 from echelon.sim.processes.to_process import End, Finish

@@ -8,7 +8,7 @@ breaking off   a failure in one of the above, or   terminates the members, kills
 finishing      members are done or ended           sends `Finish` to bridge, drives, referee and recorder, one after the other
 taking down    all of them are done                sends `End`; kills what is left
 
-The modules beside this one: `children` lists and starts the processes; `stalls` finds out who holds up a run;
+The modules beside this one: `specs` lists the processes and `children` starts them; `stalls` finds out who holds up a run;
 `endings` has the last three phases; `outcome` is what is told of a run, `failures` why it breaks off.
 
 All processes come from one fork server that has imported their modules, so fifteen start in the time of one.  No process
@@ -27,11 +27,12 @@ from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
 from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.sim.observing import new_gate
-from echelon.sim.processes.children import Child, last_words_of, list_specs, start
+from echelon.sim.processes.children import Child, last_words_of, start
 from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.endings import finish_watchers, stop_members, take_down
 from echelon.sim.processes.failures import NAMED, DivergedError, RunError, StallError, few
 from echelon.sim.processes.outcome import Outcome, Progress, outcome_of
+from echelon.sim.processes.specs import list_specs
 from echelon.sim.processes.stalls import StallWatch
 from echelon.sim.processes.to_process import Start, Told
 from echelon.sim.processes.to_supervisor import (

@@ -19,8 +19,8 @@ LATENCY_KEYS: Final = ("latency_mean", "latency_p50", "latency_p95", "latency_p9
 class LinkLatency:
     """The latencies of a link; sent = delivered + lost + in_flight.
 
-    A latency is the time from the instant of sending, which a message has in its header, to the instant from which on its
-    receiver uses it [s].  It contains what the sender computes from its inputs, and the delay that the scenario gives the link.
+    A latency is the time from the instant of sending, which a message has in its header, to its arrival at the receiver [s].
+    It contains what the sender computes from its inputs, and the delay that the scenario gives the link.
     All latencies are None if no message arrived."""
 
     source: str

@@ -37,6 +37,7 @@ LOSSY = ("--set", 'links=[{name="up",channel="state",loss=0.1}]', "--set", "clai
         ("lab --find law.lead", "must be KEY=lo:hi:step"),
         ("lab --find law.lead=0:2:0.5", "with --find law.lead=2.0: law.lead = 2.0: must be at most 1"),
         ("lab --find law.lead=0:1:0.1 --vary law.lead=0,1", "--find law.lead: is varied, too"),
+        ("lab --share 0.5", "--share: is for a search; give --find too"),
         ("lab --find law.lead=0:1:0.1 --share 2", "--share 2: must be more than 0 and at most 1"),
         ("lab --workers 0", "--workers '0': must be a number of workers"),
         ("lab --workers host:1", "--workers 'host:1': must be a number of workers, or the address of a dask scheduler"),

@@ -59,6 +59,27 @@ def test_blackouts_of_plans_that_are_random_are_refused():
         blackout(near_formation([{"channel": "state", "loss": 0.1}]), Channel.STATE, 0, 1)
 
 
+@pytest.mark.parametrize(("timing", "part", "is_exact"), [
+    ("event_driven", 0.5, False), ("event_driven", 0.0, True), ("time_driven", 0.5, True),
+])  # fmt: skip
+def test_a_blackout_of_several_channels_is_as_in_the_run_or_refused(timing, part, is_exact):
+    """An event-driven node that waits for what was lost acts at the end of its period, when the blackout may be over."""
+    plan = near_formation([], timing, duration=6.0)
+    channels, lasts_ns = (Channel.STATE, Channel.COMMAND), LASTS_NS + round(part * T * 1e9)
+    links = [link for link in plan.links if link.channel in channels]
+    if not is_exact:
+        with pytest.raises(PredictionError, match="of several channels"):
+            blackout(plan, links, BEGIN_NS, lasts_ns)
+        return
+    dark = [
+        replace(link, blackouts=((BEGIN_NS, BEGIN_NS + lasts_ns),)) if link.channel in channels else link
+        for link in plan.links
+    ]
+    series = block_series(trace_of(replace(plan, links=tuple(with_punctuality(dark, plan.nodes))))).series
+    for one, each in zip(blackout(plan, links, BEGIN_NS, lasts_ns), series, strict=True):
+        assert one.errors == pytest.approx(each.norm, rel=0.01, abs=5e-4)
+
+
 def test_blackouts_after_the_run_are_a_mistake():
     with pytest.raises(ValueError, match="must begin within the run"):
         blackout(near_formation([], duration=6.0), Channel.STATE, 7_000_000_000, 1)

@@ -243,6 +243,15 @@ def test_a_trace_in_pieces_gives_the_same(window, monkeypatch):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
+@pytest.mark.parametrize("window", [1, 2, 100])
+def test_where_pieces_meet_a_pair_that_is_just_outside_begins_a_new_violation(window, monkeypatch):
+    monkeypatch.setattr("echelon.sim.results.trace.WINDOW", window)
+    x = np.array([0.3, 0.3, np.nextafter(0.5, 1), 0.3, 0.3])
+    places = np.stack([np.stack([x, np.zeros(5)], axis=1), np.zeros((5, 2))], axis=1)
+    found = distances(at_places(places, [NO_CLAIMS])).violations
+    assert [(each.first_ns, each.last_ns) for each in found] == [(0, 2 * MS), (2 * MS, 4 * MS)]
+
+
 @pytest.mark.parametrize("enabled", [True, False])
 def test_violations_fail_whether_robots_avoid_each_other_or_not(enabled):
     places = np.zeros((12_001, 2, 2))

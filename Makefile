@@ -10,7 +10,7 @@ QUICK := -m "not slow" tests/planning tests/plan tests/controller tests/agents t
   tests/bridge/protocols tests/bridge/timing tests/bridge/can tests/sim/results tests/sim/recording tests/sim/report \
   $(addprefix tests/cli/test_cli_help.py::, test_bash_knows_all_commands_and_all_options test_scripts_of_other_shells_know_the_commands)
 
-.PHONY: help setup demo studies docs test test-quick test-lowest test-newest lint bench lock clean
+.PHONY: help setup demo studies docs test test-quick test-lowest test-newest chaos lint bench bench-vmas lock clean
 help: ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
@@ -52,8 +52,10 @@ docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, publi
 	PYTHONPATH=tests $(BIN)/python -m support.sweep_page > docs/.new && mv docs/.new docs/sweep.md
 	PYTHONPATH=tests $(BIN)/python -m support.public_names > docs/.new && mv docs/.new docs/public-names.md
 
+# Most tests wait for other processes and for clocks: files of tests run beside each other, in the order of tests/conftest.py.
+JOBS ?= 2
 test: $(VENV)/.dev ## all tests
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-quick: $(VENV)/.dev ## the quick part of the tests
 	$(BIN)/python -m pytest $(QUICK) $(ARGS)
@@ -93,6 +95,9 @@ test-newest: $(VENV)/.dev ## the quick part with the newest Python of this machi
 	  [ "$${first:=$$digest}" = "$$digest" ] || { echo "test-newest: the digests of lab differ" >&2; exit 1; }; \
 	done
 
+chaos: $(VENV)/.dev ## five hundred runs that are killed, frozen, flooded and lied to; ARGS='--from 100 --plans 50', or --seed 7 for one
+	$(BIN)/python -m chaos $(ARGS)
+
 lint: $(VENV)/.dev ## ruff, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -102,6 +107,16 @@ lint: $(VENV)/.dev ## ruff, types, import contracts
 bench: $(VENV)/.bench ## ticks per second beside peers doing the same work, and the other numbers of the README
 	$(BIN)/python -m bench $(ARGS)
 
+# PyTorch's builds for processors alone are not on PyPI, whose own are larger, for graphics cards, too.  pip makes this
+# environment, since its configuration can name where the small ones are.
+$(VENV)-vmas/.made: requirements-vmas.txt | $(VENV)/.made
+	$(BIN)/python -m venv --clear $(VENV)-vmas
+	$(VENV)-vmas/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-vmas.txt
+	@touch $@
+
+bench-vmas: $(VENV)/.run $(VENV)-vmas/.made ## many runs at once beside VMAS, in .venv-vmas; from then on `make bench` has its rows, too
+	$(BIN)/python -m bench.batch $(ARGS)
+
 lock: $(VENV)/.dev ## resolve the dependencies anew
 	$(BIN)/uv pip compile $(LOCK) pyproject.toml -o requirements.lock
 	$(BIN)/uv pip compile $(LOCK) pyproject.toml --group dev -o requirements-dev.lock
@@ -110,4 +125,4 @@ lock: $(VENV)/.dev ## resolve the dependencies anew
 LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --upgrade
 
 clean: ## forget .venv, its relatives and what tools cached
-	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest $(VENV)-vmas build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -30,9 +30,11 @@ from echelon.plugins import PART_ERRORS, Plugin
 
 GRAVITY: Final = 9.81
 """Acceleration of gravity [m/s²]"""
-_INNER: Final = (1 - sqrt(1 / 5)) / 2
-"""Inner points of the Gauss-Lobatto rule with four points on [0, 1]: `_INNER` and 1 - `_INNER`.  Its weights are 1/12, 5/12,
+INNER: Final = (1 - sqrt(1 / 5)) / 2
+"""Inner points of the Gauss-Lobatto rule with four points on [0, 1]: `INNER` and 1 - `INNER`.  Its weights are 1/12, 5/12,
 5/12, 1/12.  It is exact up to degree 5, and its two outer points are the ends, where cos θ and sin θ are needed anyway."""
+FAST_TURN: Final = 0.5
+"""With a turn of more than this [rad] a step of the paper's plant is divided into panels"""
 
 
 class RobotState(NamedTuple):
@@ -80,8 +82,8 @@ def paper_step(robot: RobotPlan) -> Step:
         x += d * (c_1 - c_0)
         y += d * (s_1 - s_0)
         turn = h * (abs(omega) + abs(omega_dot) * h)
-        if turn <= 0.5:
-            t_1, t_2 = _INNER * h, (1 - _INNER) * h
+        if turn <= FAST_TURN:
+            t_1, t_2 = INNER * h, (1 - INNER) * h
             a_1, a_2 = theta + t_1 * (omega + half * t_1), theta + t_2 * (omega + half * t_2)
             v_i, v_j = v + v_dot * t_1, v + v_dot * t_2
             ends, inner = h / 12, 5 * h / 12
@@ -92,7 +94,7 @@ def paper_step(robot: RobotPlan) -> Step:
             width = h / panels
             ends, inner = width / 12, 5 * width / 12
             for panel in range(panels):
-                for weight, node in ((ends, 0.0), (inner, _INNER), (inner, 1 - _INNER), (ends, 1.0)):
+                for weight, node in ((ends, 0.0), (inner, INNER), (inner, 1 - INNER), (ends, 1.0)):
                     t = (panel + node) * width
                     along = weight * (v + v_dot * t)
                     angle = theta + t * (omega + half * t)

@@ -6,15 +6,18 @@ the robot sends the wanted torques in TORQUE messages, and moves with the torque
 (docs/architecture.md, 5.1 and 5.2).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from math import nan
+from operator import add
 from typing import Final
 
 import numpy as np
 
-from echelon.agents.plant import LOST, make_step, state_at
+from echelon.agents.plant import LOST, RobotState, make_step, state_at
 from echelon.agents.torque import TorqueLimits, make_inverse
+from echelon.agents.torque_loop import Loop, constants, usual
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.layout import acceleration_of
 from echelon.plan.plan import Plan
@@ -33,12 +36,14 @@ class Robot:
 
     It computes torques at the beginning of each torque period.  An event-driven robot takes an acceleration in the instant of
     its arrival, and computes torques anew for the rest of the torque period (docs/architecture.md, 4.6).  The motion up to an
-    instant is computed when it is needed: when the robot sends its state, and when an acceleration arrives."""
+    instant is computed when it is needed: when the robot sends its state, and when an acceleration arrives.  `loop` is the
+    usual torque loop, as Python or compiled."""
 
-    def __init__(self, plan: Plan, index: int) -> None:
+    def __init__(self, plan: Plan, index: int, loop: Loop = usual) -> None:
         robot = plan.robots[index]
         self.index = index
         self._plan = robot
+        self._loop, self._constants = loop, constants(robot)
         self._step = make_step(robot)
         self._inverse = make_inverse(robot)
         self._limits = TorqueLimits(
@@ -121,10 +126,16 @@ class Robot:
         """Runs the torque loop and the plant through whole torque periods; returns the sums over them."""
         h, state, step, inverse, limits = self._h, self.state, self._step, self._inverse, self._limits
         right_sum = left_sum = right_square = left_square = right_peak = left_peak = 0.0
-        saturated = 0
+        passed = saturated = 0
         commanded, held = self._a is not None, self._held
         ax, ay = self._a or (0.0, 0.0)
-        for _ in range(count):
+        if self._constants is not None:
+            last = limits.tau_right, limits.tau_left, held
+            passed, after, last, sums = self._loop(count, state, (ax, ay, float(commanded)), last, self._constants)
+            state, (right_sum, left_sum, right_square, left_square, right_peak, left_peak) = RobotState(*after), sums
+            if self._limited:
+                limits.tau_right, limits.tau_left, held = last
+        for _ in range(count - passed):
             right = left = 0.0
             if commanded:
                 right, left = inverse(state, ax, ay, 0.5 * h)
@@ -248,10 +259,10 @@ class RobotOnBus(Robot):
         n = len(self._torques)
         self._period_values = (
             *self._commanded,
-            sum(right) / n,
-            sum(left) / n,
-            sum(tau * tau for tau in right) / n,
-            sum(tau * tau for tau in left) / n,
+            _total(right) / n,
+            _total(left) / n,
+            _total(tau * tau for tau in right) / n,
+            _total(tau * tau for tau in left) / n,
             max(map(abs, right)),
             max(map(abs, left)),
             float(self._limited_count),
@@ -282,6 +293,11 @@ class RobotOnBus(Robot):
         return (Message(Channel.TORQUE, self.index, time_ns // robot.torque_period_ns, time_ns, values),)
 
 
-def make_robot(plan: Plan, index: int) -> Robot:
-    """Returns the role of a robot: `RobotOnBus` if the torque path is closed, otherwise `Robot`."""
-    return RobotOnBus(plan, index) if plan.can.closed else Robot(plan, index)
+def make_robot(plan: Plan, index: int, loop: Loop = usual) -> Robot:
+    """Returns the role of a robot: `RobotOnBus` if the torque path is closed, otherwise `Robot` with its usual torque loop."""
+    return RobotOnBus(plan, index) if plan.can.closed else Robot(plan, index, loop)
+
+
+def _total(values: Iterable[float]) -> float:
+    """Returns the sum, added from left to right.  From Python 3.12 on `sum` compensates for rounding, and gives other bits."""
+    return reduce(add, values, 0.0)

@@ -21,7 +21,9 @@ def main() -> int:
     machine = lockstep.machine()
     runs, failures = lockstep.compare(list(lockstep.PEERS), options.ticks, options.repeat)
     rows = product.measure(options.repeat, options.seconds) + can.measure(options.repeat, options.seconds)
-    rows += batch.measure(options.repeat)
+    many, without = batch.measure(options.repeat)
+    rows += many
+    failures |= without
     if options.json:
         peers = {name: [asdict(one) for one in found] for name, found in runs.items()}
         print(json.dumps({"machine": machine, "peers": peers, "failures": failures, "runs": [asdict(r) for r in rows]}))
@@ -29,6 +31,7 @@ def main() -> int:
         print("  ".join(f"{key} {value}" for key, value in machine.items()), end="\n\n")
         print(lockstep.table(runs, failures), end="\n\n")
         print(product.table(rows))
+        print(batch.told(without), end="")
     return 1 if any(text.startswith("failed") for text in failures.values()) else 0
 
 

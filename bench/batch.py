@@ -1,17 +1,24 @@
 """Many runs of lab.toml at once, in robot steps per second: the batch engine, beside loops of the same laws in numpy and in
-plain Python.
+plain Python, and beside VMAS.  `python -m bench.batch` measures them alone.
 
-All three compute the law of all blocks with avoidance, each robot's inverse and limits, and its motion.  The loops have no
-tree, no links and no measures.  Their runs must end where the batch engine's do.
+The batch engine and the loops compute the law of all blocks with avoidance, each robot's inverse and limits, and its motion.
+The loops have no tree, no links and no measures.  Their runs must end where the batch engine's do.  `bench.vmas` says what VMAS
+computes.
 """
 
+import argparse
+import json
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from bench.product import Row
+from bench import vmas
+from bench.product import Row, table
 from echelon.agents.plant import make_step, state_at
 from echelon.agents.torque import TorqueLimits, make_inverse
 from echelon.controller.laws.central import CentralLaw
@@ -29,7 +36,7 @@ LATE: Final = (
 """States come 10 to 50 ms late, a tenth of them is lost, and a tenth of the commands"""
 RUNS: Final = {"batch": 400, "numpy": 400, "python": 1}
 """Runs at once"""
-SECONDS: Final = {"batch": 30, "numpy": 2, "python": 5}
+SECONDS: Final = {"batch": 30, "numpy": 2, "python": 5, "vmas": 2}
 
 
 def lab(seconds: float, *changes: str) -> Plan:
@@ -148,13 +155,19 @@ def rate(run: Callable[[Plan, int], Array], plan: Plan, runs: int) -> float:
     return runs * ticks * len(plan.robots) / (time.perf_counter() - begun_s) / 1e6
 
 
-def measure(repeats: int) -> list[Row]:
-    """Measures all, in turn.  Raises RuntimeError if a loop's runs do not end where they should."""
-    short = lab(2)
+def measure(
+    repeats: int, environments: Sequence[int] = (vmas.ENVIRONMENTS,), python: Path = vmas.PYTHON
+) -> tuple[list[Row], dict[str, str]]:
+    """Measures all, in turn, VMAS with each number of environments; returns the rows, and why VMAS has none.
+
+    Raises RuntimeError if a loop's runs do not end where they should."""
+    short = lab(SECONDS["vmas"])
     where = batch(short, 1)  # compiles
     for loop in (plain_numpy, plain_python):
         if not np.allclose(loop(short, 1), where, rtol=0, atol=1e-9):
             raise RuntimeError(f"{loop.__name__} ends elsewhere")
+    peer = vmas.Vmas(short, where, python)
+    failures = {} if peer.installed else {"vmas": vmas.MISSING}
     kinds = {
         "lab.toml, many runs: batch engine": (batch, lab(SECONDS["batch"]), RUNS["batch"]),
         "lab.toml, many runs: the same, late and lossy": (batch, lab(SECONDS["batch"], LATE), RUNS["batch"]),
@@ -162,7 +175,47 @@ def measure(repeats: int) -> list[Row]:
         "lab.toml, one run: loop in plain Python": (plain_python, lab(SECONDS["python"]), RUNS["python"]),
     }
     found: dict[str, list[float]] = {what: [] for what in kinds}
+    points: dict[str, list[float]] = {}
     for _ in range(repeats):
         for what, kind in kinds.items():
             found[what].append(rate(*kind))
-    return [Row(what, "10⁶ steps/s", tuple(rates)) for what, rates in found.items()]
+        for number in environments if not failures else ():
+            try:
+                rates = peer.rates(number)
+            except RuntimeError as error:
+                failures["vmas"] = f"failed: {error}"
+                break
+            for way, value in rates.items():
+                points.setdefault(f"points in VMAS, {number} runs a core: {way}", []).append(value)
+    found |= points if not failures else {}
+    return [Row(what, "10⁶ steps/s", tuple(rates)) for what, rates in found.items()], failures
+
+
+def told(failures: dict[str, str]) -> str:
+    """Returns a line for each peer that has no row."""
+    return "".join(f"{name}: {text}\n" for name, text in failures.items())
+
+
+def main() -> int:
+    """Measures all and prints it; returns the exit code: 1 if a peer failed, otherwise 0."""
+    parser = argparse.ArgumentParser(prog="python -m bench.batch", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--repeat", type=int, default=5, help="runs of each kind (default 5)")
+    parser.add_argument(
+        "--environments",
+        type=int,
+        nargs="+",
+        default=[vmas.ENVIRONMENTS],
+        help=f"numbers of runs that VMAS makes at once on each core (default {vmas.ENVIRONMENTS})",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    options = parser.parse_args()
+    rows, failures = measure(options.repeat, options.environments)
+    if options.json:
+        print(json.dumps({"failures": failures, "runs": [asdict(row) for row in rows]}))
+    else:
+        print(table(rows), told(failures), sep="\n", end="")
+    return 1 if any(text.startswith("failed") for text in failures.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

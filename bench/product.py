@@ -49,7 +49,7 @@ def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float
         raise RuntimeError(outcome.failure)
     ticks = plan.duration_ns / plan.robots[0].period_ns
     robots = {robot.name for robot in plan.robots}
-    memory = max(result.resident_bytes for result in outcome.processes if result.name in robots)
+    memory = max(result.memory_bytes for result in outcome.processes if result.name in robots)
     return ticks / outcome.wall_s, outcome.startup_s, memory / 1e6
 
 
@@ -94,7 +94,7 @@ def measure(repeats: int, seconds: float) -> list[Row]:
         Row("lab.toml in one process: roles and links", "× real time", tuple(alone)),
         Row("lab.toml in one process: with recording and CAN", "× real time", tuple(whole)),
         Row("start-up of 15 processes", "s", tuple(startups)),
-        Row("resident memory of a robot process, largest", "MB", tuple(memories)),
+        Row("memory of a robot process (PSS), largest", "MB", tuple(memories)),
     ]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from echelon.bridge.protocols.frame import Frame
 from echelon.messages import Message, Values
+from echelon.plan.plan import Plan
 
 BRIDGE_NODE: Final = 0
 """The node number of the bridge; drives have the numbers from 1 on"""
@@ -27,6 +28,8 @@ EMPTIED: Final = Frame(1)
 """Mark: the node is still bus-off; the frames in its queue are lost"""
 BACK: Final = Frame(2)
 """Mark: the node is on its bus again"""
+BACKWARD_NS: Final = 60_000_000_000
+"""A frame of a message may be older than the bring-up of the drives by this much [ns]: what lay in a socket"""
 
 
 class TimedFrame(NamedTuple):
@@ -60,6 +63,32 @@ def pack(frames: Iterable[TimedFrame]) -> Values:
 def frames_of(message: Message) -> list[TimedFrame]:
     """Returns the frames in a message, without the marks."""
     return [timed for timed in unpack(message.values) if timed.bus != NO_BUS]
+
+
+class FrameBounds:
+    """The bounds of the values of a plan's messages with frames, for `echelon.runtime.admission`."""
+
+    def __init__(self, plan: Plan) -> None:
+        nodes = 2 * len(plan.robots) + 1  # the bridge, and at most a drive for each wheel
+        buses = [*range(len(plan.can.buses)), NO_BUS]
+        self._known = np.zeros(nodes << 8, bool)
+        self._known[[node << 8 | bus for bus in buses for node in range(nodes)]] = True
+        self._first_ns = -plan.can.bring_up_ns - BACKWARD_NS
+        self._ahead_ns = 0 if plan.bridge is None else plan.bridge.period_ns
+
+    def __call__(self, values: Values, time_ns: int) -> bool:
+        """Returns whether the values are whole frames with at most eight data bytes, of buses and nodes that there are, each at
+        most a period later than its message."""
+        if values.size % 3:
+            return False
+        words = values.view("<u8").reshape(-1, 3)
+        instants, heads = words[:, 0].view("<i8"), words[:, 1]
+        if not (self._first_ns <= int(instants.min()) and int(instants.max()) <= time_ns + self._ahead_ns):
+            return False
+        places = heads >> 16
+        if int(places.max()) >= self._known.size or not self._known[places].all():
+            return False
+        return int((heads >> 12 & 15).max()) <= 8
 
 
 def unpack(values: Values) -> list[TimedFrame]:

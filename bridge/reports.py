@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from echelon.bridge.referee_reports import RefereeReport
+
 EVENTS: Final = 1000
 """How many events of a bus a report keeps"""
 
@@ -58,7 +60,7 @@ class BusReport:
     load: float
     """Share of the time that the frames took, or would take on a real bus: 1 is a full bus"""
     lost: int = 0
-    """Frames that were lost: a queue was full, or its node was bus-off"""
+    """Frames that were lost: a queue was full, or its node was bus-off, or the frame was too old to be sent"""
     destroyed: int = 0
     """Attempts to send that an error destroyed; the frame is sent again"""
     events: tuple[BusEvent, ...] = ()
@@ -93,6 +95,21 @@ class ScheduledEvent:
     """What happens, in words"""
     whom: tuple[str, ...]
     """Names of the robots or buses that it concerns"""
+
+
+@dataclass(frozen=True, slots=True)
+class IntrusionReport:
+    """Frames with an identifier of the run that no process of the run sent."""
+
+    bus: str
+    """Name of the bus in the scenario"""
+    sender: str
+    """Address of the sender: an IP address for another host, address and port for a program on this one, `another node` on a
+    bus whose frames do not say who sent them"""
+    id: str
+    """Identifier, three hexadecimal digits"""
+    frames: int
+    """How many"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +164,8 @@ class DrivesReport:
     """Messages of other processes that the drives refused, by reason"""
     foreign: int = 0
     """Frames on the buses that no process of the run had announced"""
+    intrusions: tuple[IntrusionReport, ...] = ()
+    """What others sent with identifiers of the drives; `CanReport.with_drives` merges them into the run's"""
     failed: int = 0
     """Frames that a bus did not accept (wall clock)"""
     buses: tuple[BusReport, ...] = ()
@@ -172,77 +191,6 @@ class TorqueTimes:
     """Largest [s]"""
     lost_on_links: int
     """Torques that were lost on their links"""
-
-
-@dataclass(frozen=True, slots=True)
-class FindingReport:
-    """A finding of the referee: something on a bus that breaks the plan or the protocol."""
-
-    time: float
-    """When it was found [s]"""
-    bus: str
-    """Name of the bus"""
-    id: str
-    """Identifier, three hexadecimal digits"""
-    kind: str
-    """Kind of the finding, for example `counter gap`"""
-    text: str
-    """The finding in words"""
-    robot: str
-    """Name of the robot; empty if the finding concerns no single robot"""
-
-
-@dataclass(frozen=True, slots=True)
-class TimingReport:
-    """The periods between the frames of one identifier [s]; None if there were too few frames."""
-
-    frames: int
-    """Number of frames"""
-    period_mean: float | None = None
-    """Mean period [s]"""
-    period_min: float | None = None
-    """Shortest period [s]"""
-    period_max: float | None = None
-    """Longest period [s]"""
-    jitter: float | None = None
-    """Standard deviation of the periods"""
-
-
-@dataclass(frozen=True, slots=True)
-class RefereeReport:
-    """The referee's report."""
-
-    frames: int
-    """Frames that were judged"""
-    unknown: int
-    """Frames with identifiers that no robot of the plan uses"""
-    kinds: Mapping[str, int]
-    """Findings by kind"""
-    findings: tuple[FindingReport, ...]
-    """The first findings, in full"""
-    identifiers: Mapping[str, TimingReport]
-    """By bus and identifier, for example `can0:101`"""
-    source: str = "can.log"
-    """Where the frames came from: `can.log`, or `bus` if the referee listened itself"""
-    until: float | None = None
-    """When the run was stopped, if it was [s]: only frames up to then are judged; None: all frames are"""
-    later: int = 0
-    """Frames in can.log after `until`, which are not judged: the processes of a run end one after the other"""
-
-    @property
-    def up_to(self) -> str:
-        """Up to when frames are judged, in words that follow their number; empty if all are."""
-        return "" if self.until is None else f" up to {self.until:g} s, where the run was stopped"
-
-    @property
-    def after_stop(self) -> str:
-        """A sentence about the frames after the stop, without a capital or a full stop; empty if there are none."""
-        if self.until is None or not self.later:
-            return ""
-        return (
-            f"the run was stopped at {self.until:g} s; can.log and the numbers of the buses include {self.later} later frames, "
-            "which are not judged"
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,6 +235,8 @@ class CanReport:
     """By name of the robot"""
     foreign: int = 0
     """Frames that no process of this run had announced"""
+    intrusions: tuple[IntrusionReport, ...] = ()
+    """What others sent with identifiers of this run.  Frames from other hosts are not used on a multicast bus"""
     refused: Mapping[str, int] = field(default_factory=dict)
     """Messages of other processes that the bridge refused, by reason"""
     drives: DrivesReport | None = None
@@ -314,7 +264,12 @@ class CanReport:
             if drives.buses
             else self.buses
         )
-        return replace(self, drives=replace(drives, buses=()), buses=buses)
+        return replace(
+            self,
+            drives=replace(drives, buses=(), intrusions=()),
+            buses=buses,
+            intrusions=self.intrusions + drives.intrusions,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,8 @@ import numpy as np
 from echelon.controller.trajectory import Desired
 from echelon.messages import STATE_FIELDS, Channel, Heard, Message, Values, field_index
 from echelon.plan.layout import CENTROID, GroupStateLayout, length
-from echelon.plan.plan import Array, LinkPlan, NodePlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, NodePlan, Plan
 
 EXTRAPOLATE, PREDICT = "extrapolate", "predict"
 _ACCELERATION = field_index(STATE_FIELDS, "ax", "ay")

@@ -13,10 +13,15 @@ pushed apart with `force_limit` in this case.  `force_limit` also bounds ∇f ou
 finite slope.
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from echelon.plan.plan import Array, AvoidancePlan
+
+LARGEST: Final = 2_000_000
+"""Largest number of pairs times robots up to which a matrix gives the differences of all pairs"""
 
 
 def potential(distance: Array, plan: AvoidancePlan) -> Array:
@@ -35,14 +40,17 @@ class PairForces:
         self._sensing_square = plan.sensing_radius**2
         self._avoidance_square = plan.avoidance_radius**2
         self._limit = plan.force_limit
-        self._apart = np.zeros((len(first), robots))  # the matrix from robots' positions to p_i - p_j of each pair
-        self._apart[np.arange(len(first)), first] = 1.0
-        self._apart[np.arange(len(first)), second] = -1.0
+        self._first, self._second, self._robots = first, second, robots
+        self._apart: Array | None = None  # the matrix from robots' positions to p_i - p_j of each pair
+        if len(first) * robots <= LARGEST:
+            self._apart = np.zeros((len(first), robots))
+            self._apart[np.arange(len(first)), first] = 1.0
+            self._apart[np.arange(len(first)), second] = -1.0
 
     def __call__(self, positions: Array) -> Array | None:
         """Returns the force ∇f on every robot, (robots, 2) [m/s²], at `positions`, (robots, 2) [m].  Returns None if no pair is
         within the sensing radius."""
-        apart = self._apart @ positions
+        apart = positions[self._first] - positions[self._second] if self._apart is None else self._apart @ positions
         q = np.einsum("ij,ij->i", apart, apart)
         if not q.size or np.minimum.reduce(q) >= self._sensing_square:
             return None
@@ -53,11 +61,22 @@ class PairForces:
             push = np.where(gap > 0, np.minimum(slope, self._limit), self._limit)
             direction = np.where(distance[:, None] > 0, apart / distance[:, None], [1.0, 0.0])
         push = np.where(q < self._sensing_square, push, 0.0)
-        return np.asarray(self._apart.T @ (push[:, None] * direction))
+        each = push[:, None] * direction
+        if self._apart is not None:
+            return np.asarray(self._apart.T @ each)
+        forces = np.zeros((self._robots, 2))
+        near = np.flatnonzero(push)
+        np.add.at(forces, self._first[near], each[near])
+        np.subtract.at(forces, self._second[near], each[near])
+        return forces
 
 
 def pairs_between(groups: list[range]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Returns all pairs of robots from two different `groups`, as two index arrays; the first index is of the earlier group."""
+    if all(len(group) == 1 for group in groups):
+        robots = np.array([group[0] for group in groups], dtype=np.intp)
+        one, other = np.triu_indices(len(groups), 1)
+        return robots[one], robots[other]
     pairs = [(i, j) for at, group in enumerate(groups) for other in groups[at + 1 :] for i in group for j in other]
     array = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     return array[:, 0], array[:, 1]

@@ -1,15 +1,19 @@
 """Files that appear whole or not at all, and locks that end with their process."""
 
 import fcntl
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
     """Gives a path to write to, and puts what was written there in the place of `path` at the end.
+
+    With `durable` it is on the disk then, so that a loss of power leaves the old file or the new one.
 
     If writing fails, `path` stays as it was.  What is no regular file, such as a pipe, is written to directly.  Raises OSError
     that names `path`."""
@@ -20,7 +24,11 @@ def replacing(path: Path) -> Iterator[Path]:
     partial = target.with_name(f".{target.name}.part")
     try:
         yield partial
+        if durable:
+            _sync(partial)
         os.replace(partial, target)
+        if durable:
+            _sync(target.parent)
     except BaseException as error:
         if isinstance(error, OSError) and error.filename in (None, str(partial)):
             error.filename, error.filename2 = str(path), None
@@ -31,10 +39,26 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file that is there whole or not at all.  Raises OSError that names it."""
-    with replacing(path) as partial:
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_text(path: Path, text: str, durable: bool = False) -> None:
+    """Writes a text file that is there whole or not at all; `durable` as in `replacing`.  Raises OSError that names it."""
+    with replacing(path, durable) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def read_json(data: str | bytes) -> Any:
+    """Returns what a JSON text from outside says.  Raises ValueError if it is none, or nested too deep."""
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
 
 
 def lock(path: Path) -> int:

@@ -1,10 +1,12 @@
 """Chooses the URL of each bus of a run: from `--can`, else from the scenario; and checks it against this machine."""
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Final
 
-from echelon.bridge.can.bus_url import interface_is_up, resolve_url, why_no_multicast
+from echelon.bridge.can.bus_url import free_multicast_url, interface_is_up, resolve_url, why_no_multicast
+from echelon.bridge.can.claim import DRIVES, HOST, BusTakenError, Claim, is_claimed
+from echelon.bridge.can.link_kind import is_hardware
 from echelon.errors import UsageError
 from echelon.plan.can_plan import DISTURBANCES
 from echelon.plan.plan import Plan
@@ -54,7 +56,7 @@ def check_wall_clock(plan: Plan, urls: Sequence[str]) -> None:
             f"events of kind {disturbed[0]!r}: on a wall clock a bus takes its own time, so its errors cannot be scheduled"
             + ("; with --set can.timing=bits a virtual bus is as slow as a real one" if plan.can.virtual_drives else "")
         )
-    real = [url for url in urls if (Path("/sys/class/net") / url.partition(":")[2] / "device").exists()]
+    real = [url for url in urls if is_hardware(url)]
     if plan.can.paced and real:
         raise UsageError(
             f"can.timing = 'bits': {real[0]} is a real bus, which takes its own time; leave can.timing out"
@@ -70,4 +72,24 @@ def _checked_bus(url: str, number: int) -> str:
     kind, _, name = resolved.partition(":")
     if kind == "socketcan" and not interface_is_up(name):
         raise UsageError(f"--can {url}: there is no network interface {name} that is up")
+    if url == "auto" and any(is_claimed(resolved, side) for side in (HOST, DRIVES)):
+        return free_multicast_url()
     return resolved
+
+
+@contextmanager
+def claimed(urls: Sequence[str], *sides: str) -> Iterator[None]:
+    """Claims sides of the buses at these URLs.  Raises UsageError if another run has one of them."""
+    with ExitStack() as stack:
+        for url in urls:
+            for side in sides:
+                try:
+                    stack.enter_context(Claim(url, side))
+                except BusTakenError as taken:
+                    raise UsageError(f"{url}: {taken}; give another port or interface with --can") from None
+        yield
+
+
+def sides_of(plan: Plan) -> tuple[str, ...]:
+    """Returns the sides of its buses that a run of this plan needs for itself."""
+    return (HOST, DRIVES) if plan.can.closed and plan.can.virtual_drives else (HOST,)

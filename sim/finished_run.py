@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.bridge.referee.referee import read_run_log
+from echelon.bridge.referee.log import read_run_log
 from echelon.errors import UserError
 from echelon.messages import STATE_FIELDS
 from echelon.plan.plan import Plan
 from echelon.sim.results.block_series import Blocks, BlockSeries, block_series
-from echelon.sim.results.records import LinkResult, Summary
+from echelon.sim.results.measure_records import LinkResult
+from echelon.sim.results.records import Summary
 from echelon.sim.results.tables import (
     DESIRED,
     PARTS,

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from echelon.bridge.can.link_kind import is_hardware
 from echelon.errors import UsageError, UserError
 from echelon.plan.plan import Plan
+from echelon.planning.members import MAX_ROBOTS
 from echelon.scenario.tables import Scenario
-from echelon.sim.bus_urls import NO_MULTICAST, bus_urls, check_wall_clock
+from echelon.sim.bus_urls import NO_MULTICAST, bus_urls, check_wall_clock, claimed, sides_of
 from echelon.sim.finished_run import Run
+from echelon.sim.interruption import Interruption, interruption
 from echelon.sim.out_folder import REPORT, OutFolder, out_folder, run_files
 from echelon.sim.processes.children import warm_up
 from echelon.sim.results.can_lines import some
@@ -41,6 +44,8 @@ class Launch:
     """Go on when a robot's state is not finite"""
     replace: bool = False
     """Delete the run of another scenario that is in `out`"""
+    real_bus: bool = False
+    """Let a run in virtual time, or one that mirrors torques, send its frames onto a bus of hardware"""
     observe: bool = False
     """Open the run for observers, who can read and never write"""
 
@@ -59,10 +64,11 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
     `plan` is the plan of `scenario`.  A run that breaks off is returned, too, with the reason as its `failure`.  Raises
     UserError for options that contradict each other, and OSError if a file of the run cannot be written."""
     if options.engine == "processes":
-        warm_up()
+        warm_up(plan)
     urls = bus_urls(plan, options.can, options.engine == "inprocess")
     _check(plan, options, urls)
     with ExitStack() as stack:
+        stack.enter_context(claimed(urls, *sides_of(plan)))
         files = run_files(plan, bool(urls) or plan.can.closed, options.observe)
         try:
             folder = stack.enter_context(out_folder(scenario.name, options.out, files, options.replace))
@@ -71,10 +77,18 @@ def launch(scenario: Scenario, plan: Plan, options: Launch) -> Run:
                 why = "is a file, and must be a folder" if isinstance(error, FileExistsError) else error.strerror
                 raise UsageError(f"--out {options.out}: {why}") from None
             raise UsageError(f"{error.filename}: {error.strerror}; give a folder with --out") from None
-        return _run_in(folder, scenario, plan, options, urls)
+        interrupted = stack.enter_context(interruption())
+        return _run_in(folder, scenario, plan, options, urls, interrupted)
 
 
-def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, urls: tuple[str, ...]) -> Run:
+def _run_in(
+    folder: OutFolder,
+    scenario: Scenario,
+    plan: Plan,
+    options: Launch,
+    urls: tuple[str, ...],
+    interrupted: Interruption,
+) -> Run:
     """Runs a scenario in a folder that is made and locked.  Raises OSError."""
     display = Display(plan, quiet=options.quiet)
     if not options.quiet:
@@ -95,6 +109,7 @@ def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, 
             stall_timeout_s=options.stall_timeout_s,
             keep_going=options.keep_going,
             observe=options.observe,
+            interrupted=interrupted,
         )
     except OSError as error:
         if error.filename is None:  # a write to an open file failed
@@ -115,6 +130,8 @@ def _run_in(folder: OutFolder, scenario: Scenario, plan: Plan, options: Launch, 
 
 def _check(plan: Plan, options: Launch, urls: Sequence[str]) -> None:
     """Raises UsageError for options that contradict each other or the plan."""
+    if urls and not plan.can.enabled and len(plan.robots) > MAX_ROBOTS:
+        raise UsageError(f"--can: {len(plan.robots)} robots, but a bus has identifiers for {MAX_ROBOTS}")
     if options.clock == "wall":
         if plan.can.closed and (not urls or options.engine == "inprocess"):
             raise UsageError("can.path = 'closed' with --clock wall: needs --engine processes, and a bus")
@@ -124,6 +141,15 @@ def _check(plan: Plan, options: Launch, urls: Sequence[str]) -> None:
     if plan.can.closed and options.engine == "processes" and any(url.startswith("virtual") for url in urls):
         raise UsageError(
             "--can virtual: is a bus inside one process; the closed torque path needs one between processes"
+        )
+    hardware = [] if options.real_bus else [url for url in urls if is_hardware(url)]
+    if hardware and (options.clock == "virtual" or not plan.can.closed):
+        how = (
+            "in virtual time, as fast as they are made" if options.clock == "virtual" else "without hearing the drives"
+        )
+        raise UsageError(
+            f"--can {hardware[0]}: is hardware, and this run sends torques {how}; give --real-bus if that is what you want, "
+            "or a virtual bus"
         )
     if options.observe and options.engine == "inprocess":
         raise UsageError("--observe: needs --engine processes; nobody can read a run in one process")

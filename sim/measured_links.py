@@ -12,7 +12,8 @@ from echelon.files import write_text
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.delay_tables import LOST
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.planning.delays import LOST_WORD
 from echelon.runtime.arrivals import FILE
 from echelon.scenario.tables import Scenario

@@ -29,7 +29,12 @@ if TYPE_CHECKING:
 _CHOICE: Final = re.compile(r"(?<![\w-])--(clock|engine) (virtual|wall|inprocess|processes)\b")
 """An option with one of its values"""
 _OPTION: Final = re.compile(r"(?<![\w-])--(set (?=\S)|[a-z]+(?:-[a-z]+)*)")
-_AS_ARGUMENT: Final = {"set ": "", "replace": "replace=True", "keep-going": "keep_going=True"}
+_AS_ARGUMENT: Final = {
+    "set ": "",
+    "replace": "replace=True",
+    "keep-going": "keep_going=True",
+    "real-bus": "real_bus=True",
+}
 
 
 @contextmanager
@@ -85,6 +90,7 @@ def run(
     clock: Literal["virtual", "wall"] = "virtual",
     out: str | Path | None = None,
     can: str | None = None,
+    real_bus: bool = False,
     replace: bool = False,
     report: bool = False,
     quiet: bool = False,
@@ -98,6 +104,7 @@ def run(
     clock       `virtual`: as fast as messages come; `wall`: in real time
     out         folder of the run; None: a new one, `runs/<scenario>-<utc time>`
     can         URLs of the CAN buses, with commas between; None: what the scenario says
+    real_bus    let a run in virtual time, or one that mirrors torques, send frames onto a bus of hardware
     replace     delete the run of another scenario that is in `out`
     report      write report.html
     quiet       show no progress on standard error
@@ -111,6 +118,7 @@ def run(
         clock=clock,
         out=None if out is None else Path(out),
         can=can,
+        real_bus=real_bus,
         report=report,
         quiet=quiet,
         keep_going=keep_going,
@@ -130,7 +138,7 @@ def sweep(
     find: Mapping[str, str] | None = None,
     share: float = 0.9,
     seeds: int | None = None,
-    engine: Literal["batch", "inprocess", "processes"] | None = None,
+    engine: Literal["batch", "gpu", "inprocess", "processes"] | None = None,
     workers: int | str | None = None,
     out: str | Path | None = None,
     allow_unstable: bool = False,

@@ -9,14 +9,21 @@ import os
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, Self
 
+from echelon.bridge.frame_message import FrameBounds
 from echelon.errors import UsageError
+from echelon.files import read_json
 from echelon.messages import Message
+from echelon.plan.can_plan import NEVER_NS
+from echelon.plan.plan import Plan
+from echelon.runtime.admission import ALWAYS, Refusals
+from echelon.runtime.admission_rules import admissions_of
 from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import Session, loopback_endpoints
-from echelon.runtime.wire import SCHEMA_VERSION, WireError, decode, run_keys, token_key
+from echelon.runtime.wire import SCHEMA_VERSION, data_key, run_keys, token_key
 
 TICKET: Final = "observe.json"
 HIGH_WATER: Final = 16384
@@ -51,7 +58,7 @@ class Ticket:
     def read(cls, folder: Path) -> Self:
         """Reads the ticket in the folder of a run.  Raises UsageError if there is none, or it cannot be used."""
         try:
-            ticket = cls(**json.loads((folder / TICKET).read_text(encoding="utf-8")))
+            ticket = cls(**read_json((folder / TICKET).read_bytes()))
         except FileNotFoundError:
             raise UsageError(
                 f"{folder}: holds no {TICKET}; `echelon run … --observe` opens a run for observers"
@@ -86,29 +93,34 @@ def gate_token(run: str) -> str:
     return token_key(run, "observers", "gate", "gate")
 
 
-def observe(ticket: Ticket, under: str = "") -> Iterator[Message]:
-    """Yields the messages of a run until it ends: of the member with the path `under` in the tree and of all below it.
+def observe(ticket: Ticket, plan: Plan, under: str = "", refusals: Refusals | None = None) -> Iterator[Message]:
+    """Yields the messages of a run of a plan until it ends: of the member with the path `under` and of all below it.
 
-    Raises UsageError if the run cannot be reached."""
+    What is no message of the plan is counted in `refusals` and left out.  Raises UsageError if the run cannot be reached."""
     guest = Identity(ticket.user, new_identity(ticket.user, ()).zenoh_id, ticket.password, ())
     host = Identity("observers", ticket.zenoh_id, "", run_keys(ticket.run))
     ended = threading.Event()
+    paths = [one.path for one in plan.all_roles]
+    counts = Refusals() if refusals is None else refusals
+    admissions = admissions_of(plan, range(len(paths)), counts, virtual=False, frames=FrameBounds(plan))
     with Session(
         listen=[],
         connect=[ticket.endpoint],
         lockstep=False,
         credentials=Credentials(guest, run_keys(ticket.run), hosts=(host,)),
     ) as session:
-        keys = [f"echelon/{ticket.run}/{under}/**"] if under else run_keys(ticket.run)
-        inbox = session.inbox(keys, HIGH_WATER)
+        doors = {
+            data_key(ticket.run, paths[each.source], each.channel): partial(each.admit, now_ns=NEVER_NS)
+            for each in admissions
+            if not under or f"{paths[each.source]}/".startswith(f"{under}/")
+        }
+        inbox = session.checked_inbox(doors, HIGH_WATER)
         token = gate_token(ticket.run)
         if session.watch_tokens(token, lambda key: ended.set()).wait([token], CONNECT_S):
             raise UsageError(f"the run {ticket.run} does not answer at {ticket.endpoint}; is it over?")
         over = False
         while not over:
             over = ended.is_set()
-            for payload in inbox.take(0.2):
-                try:
-                    yield decode(payload)
-                except WireError:  # of another version, which the ticket excludes
-                    continue
+            for message in inbox.take(0.2):
+                if message.values.size or message.channel not in ALWAYS:
+                    yield message

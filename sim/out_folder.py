@@ -13,6 +13,7 @@ not written by a run                        is refused if it needs the name  is 
 
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from typing import Final
 from echelon.bridge.protocols.plan_dbc import dbc_names
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import UsageError
-from echelon.files import is_locked, lock, write_text
+from echelon.files import is_locked, lock, read_json, write_text
 from echelon.plan.plan import Plan
 from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.shipped import EFFECTIVE
@@ -41,6 +42,10 @@ TABLES: Final = ("csv", "parquet")
 """Folders of exported tables"""
 TRACES: Final = "latencies"
 """Folder of the traces that are made from a run's latencies (echelon.sim.measured_links)"""
+
+_DBC: Final = re.compile(r"torque(?:-[\w.-]+)?\.dbc")
+_ALWAYS: Final = (EFFECTIVE, STATE, RECORDING, CUT, ARRIVALS, SUMMARY, REPORT, LOG, TICKET)
+"""Names that a run may write.  Of a run that was killed no hashes are noted, and these count as its files by their names"""
 
 
 def run_files(plan: Plan, bus: bool, observed: bool = False) -> tuple[str, ...]:
@@ -143,10 +148,12 @@ def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> No
             raise UsageError(f"--out {path}: a run is going on there; give another folder")
     earlier = _earlier(path)
     left, edited = {}, set[str]()
+    known = {*files, *_ALWAYS, *(name for name in (earlier[1] if earlier else ()) if _DBC.fullmatch(name))}
     for name, digest in earlier[1].items() if earlier else ():
         file = path / name
         if file.is_file():
-            if digest is None or _hash(file) == digest:
+            ours = not file.is_symlink() and (name in known if digest is None else _hash(file) == digest)
+            if ours:
                 left[name] = file
             else:
                 edited.add(name)
@@ -168,7 +175,7 @@ def _clear(path: Path, scenario: str, files: Iterable[str], replace: bool) -> No
 def _earlier(path: Path) -> tuple[str, dict[str, str | None]] | None:
     """Returns the scenario's name and the files of the run in a folder, with their SHA-256 or None; None without a note."""
     try:
-        note = json.loads((path / NOTE).read_text(encoding="utf-8"))
+        note = read_json((path / NOTE).read_bytes())
         files = {str(name): digest for name, digest in note["files"].items() if Path(name).name == name}
         return str(note["scenario"]), files
     except (OSError, ValueError, TypeError, KeyError, AttributeError):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
-from echelon.bridge.referee.referee import read_run_log
+from echelon.bridge.referee.log import read_run_log
 from echelon.bridge.reports import BusReport, CanReport
 from echelon.bridge.timing.bus_load import BitCount
 from echelon.bridge.timing.buses import scheduled
@@ -128,6 +128,7 @@ def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
         failure=_failure(trace, result, bool(links)),
         version=metadata.get("echelon", ""),
         python=metadata.get("python", ""),
+        recorded_every=float(metadata["recorded every"]) if "recorded every" in metadata else None,
     )
     log, can = folder / "can.log", None
     if log.exists():

@@ -7,6 +7,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from echelon import __version__
-from echelon.bridge.reports import RefereeReport
+from echelon.bridge.referee_reports import RefereeReport
 from echelon.bridge.stations.closed import LOG
 from echelon.bridge.stations.opening import open_bridge
 from echelon.errors import PartRunError
@@ -27,7 +28,7 @@ from echelon.planning.loading import effective_toml
 from echelon.scenario.tables import Scenario
 from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
-from echelon.sim.interruption import interruption
+from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
 from echelon.sim.parts.foreign_parts import stalled_in, unstalled
@@ -36,12 +37,13 @@ from echelon.sim.processes.outcome import Outcome, Progress
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.processes.watchers import RunRecorder
 from echelon.sim.recording.time_order import TimeOrder, speakers
-from echelon.sim.results.records import ProcessResult, RunFacts, Summary
+from echelon.sim.results.records import ProcessResult, RunFacts, StandstillResult, Summary
 from echelon.sim.results.rendering import write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
 from echelon.sim.run_state import write_state
 from echelon.sim.view.live import Display
+from echelon.sim.wall_load import wall_load
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions are noted in the recording"""
@@ -59,16 +61,19 @@ def execute(
     stall_timeout_s: float = 30.0,
     keep_going: bool = False,
     observe: bool = False,
+    interrupted: Interruption | None = None,
 ) -> tuple[Summary, Trace]:
     """Runs a plan and writes the files of the run, except for the report; returns its summary and its trace.
 
     `plan` is the plan of `scenario`, `out` the locked folder.  `engine` is `processes` or `inprocess`, `clock` is `virtual` or
     `wall`.  `can_urls` has a URL for each bus, or none if the run makes no frames.  A run in virtual time without progress for
     `stall_timeout_s` is given up.  A run ends at the first instant at which a robot's state is not finite, unless
-    `keep_going` is True.  With `observe`, others can read the messages of a run as processes while it goes on.  A run that
-    breaks off has its reason in the summary; its exception is not raised.
+    `keep_going` is True.  With `observe`, others can read the messages of a run as processes while it goes on.  `interrupted`
+    notes the signals that ask the run to end; without it this function notes them itself.  A run that breaks off has its reason
+    in the summary; its exception is not raised.
 
-    Raises OSError if a file cannot be written; in one process also OSError or ValueError if a bus cannot be opened."""
+    Raises OSError if a file cannot be written, with a note if the run broke off, too; in one process also OSError or ValueError
+    if a bus cannot be opened."""
     begun, folder = datetime.now(UTC), out.path
     parts = keep_parts(scenario, folder, (NOTE, *run_files(plan, bus=True)))
     toml = effective_toml(scenario, parts.names)
@@ -83,10 +88,17 @@ def execute(
         "echelon": version("echelon"),
         "python": platform.python_version(),
     }
+    load = wall_load(plan, bool(can_urls)) if clock == "wall" and engine == "processes" else None
+    every_ns = 0 if load is None else load.every_ns
+    if load is not None and load.warning:
+        display.say(f"warning: {load.warning}")
+    if every_ns:
+        metadata["recorded every"] = f"{every_ns / 1e9:g}"
     metadata |= {package: version(package) for package in PACKAGES} | parts.metadata
     if engine == "inprocess":
         recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files, keep_going)
-        outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s)
+        with interruption() if interrupted is None else nullcontext(interrupted) as noted:
+            outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s, noted)
     else:
         supervisor = Supervisor(
             plan,
@@ -101,6 +113,8 @@ def execute(
             stall_timeout_s=stall_timeout_s,
             keep_going=keep_going,
             observe=observe,
+            interrupted=interrupted,
+            every_ns=every_ns,
         )
         if supervisor.ticket is not None:
             supervisor.ticket.write(folder)
@@ -117,9 +131,14 @@ def execute(
             outcome.failure = outcome.failure or str(error)
     display.close()
     summary = summarise(
-        outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun), parts.results
+        outcome.trace, outcome.links, can, _run_facts(plan, outcome, engine, clock, begun, every_ns), parts.results
     )
-    write_summary(summary, folder / SUMMARY)
+    try:
+        write_summary(summary, folder / SUMMARY)
+    except OSError as error:
+        if outcome.failure:
+            error.add_note(outcome.failure)
+        raise
     return summary, outcome.trace
 
 
@@ -127,7 +146,7 @@ def judged(log: Path, plan: Plan, clock: str, whole: bool, until_ns: int | None 
     """Returns the referee's report on a run's can.log.
 
     On a wall clock frames may be later, since processes wait for a processor.  `whole` and `until_ns` as in `judge_log`."""
-    from echelon.bridge.referee.referee import judge_log
+    from echelon.bridge.referee.log import judge_log
 
     tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
     return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole, until_ns=until_ns)
@@ -141,6 +160,7 @@ def _in_process(
     recorder: Callable[[], RunRecorder],
     display: Display,
     stall_timeout_s: float,
+    interrupted: Interruption,
 ) -> Outcome:
     """Runs a plan in one process, with recorder and bridge; returns its outcome.
 
@@ -162,8 +182,9 @@ def _in_process(
         recording.add(order.push(bridge.take(batch)))
 
     time_ns = 0
+    error: BaseException | None = None
     try:
-        with interruption(bridge.interrupt) as interrupted:
+        with interrupted.during(Raises.SECOND, bridge.interrupt):
             for time_ns in unstalled(plan, engine.instants(), stall_timeout_s):
                 if clock == "wall":
                     pass_on()
@@ -189,20 +210,28 @@ def _in_process(
                     break
     except (KeyboardInterrupt, SystemExit):
         failure = "interrupted"
-    except PartRunError as error:
-        failure = str(error)
-    except TookTooLong as error:
-        who = stalled_in(plan, error)
+    except PartRunError as why:
+        failure = str(why)
+    except TookTooLong as why:
+        who = stalled_in(plan, why)
         failure = f"stalled for {stall_timeout_s:.0f} s at t = {time_ns / 1e9:g} s: everyone waits for {who}"
+    except BaseException as other:
+        error = other
     wall_s = time.monotonic() - begun_s
-    try:
-        pass_on()
-    except (SystemExit, PartRunError):
-        pass
-    try:
-        bridge.stop()
-    except PartRunError as error:
-        failure = failure or str(error)
+    with interrupted.during(Raises.NONE):
+        try:
+            pass_on()
+        except (SystemExit, PartRunError):
+            pass
+        except BaseException as other:
+            error = error or other
+        try:
+            bridge.stop()
+        except PartRunError as why:
+            failure = failure or str(why)
+    if error is not None:
+        bridge.close()
+        raise error
     recording.add(order.rest())
     links = engine.link_counts()
     recording.close(links)
@@ -225,15 +254,16 @@ def _in_process(
     )
 
 
-def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: datetime) -> RunFacts:
+def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: datetime, every_ns: int) -> RunFacts:
     """Returns the facts about a run for its summary: how it was made, how fast it was, what it used."""
     common_ns = outcome.trace.common_ns()
     # The period that begins at the last instant is simulated, too.
     simulated_s = (int(common_ns[-1]) + plan.robots[0].period_ns) / 1e9 if len(common_ns) else 0.0
     factor = simulated_s / outcome.wall_s if outcome.wall_s > 0 else None
     runners = [process.runner for process in outcome.processes if process.runner is not None]
+    refusals = outcome.refusals()
     robots = {robot.name for robot in plan.robots}
-    of_robots = [process.resident_bytes for process in outcome.processes if process.name in robots]
+    of_robots = [process.memory_bytes for process in outcome.processes if process.name in robots]
     return RunFacts(
         engine=engine,
         clock=clock,
@@ -252,8 +282,15 @@ def _run_facts(plan: Plan, outcome: Outcome, engine: str, clock: str, begun: dat
         late_stages=sum(runner.late for runner in runners),
         stages=sum(runner.stages for runner in runners),
         latest=max((runner.latest_ns for runner in runners), default=0) / 1e9,
-        refused=sum(sum(runner.refused.values()) for runner in runners),
+        refused=sum(each.messages for each in refusals),
+        refusals=refusals,
         resident_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 if engine == "inprocess" else None,
-        resident_bytes_robot_max=max(of_robots, default=None),
-        processes={process.name: ProcessResult(process.cpu_s, process.resident_bytes) for process in outcome.processes},
+        memory_bytes_robot_max=max(of_robots, default=None),
+        processes={process.name: ProcessResult(process.cpu_s, process.memory_bytes) for process in outcome.processes},
+        recorded_every=every_ns / 1e9 if every_ns else None,
+        thinned=outcome.thinned,
+        standstills={
+            name: StandstillResult(lasted_ns / 1e9, from_ns / 1e9)
+            for name, (lasted_ns, from_ns) in outcome.standstills.items()
+        },
     )

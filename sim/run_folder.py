@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.referee.referee import read_run_log
+from echelon.bridge.referee.log import read_run_log
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import UserError
 from echelon.plan.plan import Plan

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from echelon.files import is_locked, write_text
+from echelon.files import is_locked, read_json, write_text
 
 STATE: Final = "run.json"
 
@@ -37,8 +37,10 @@ def write_state(folder: Path, engine: str, clock: str, buses: dict[str, str]) ->
 def read_state(folder: Path) -> RunState | None:
     """Returns the content of run.json in a run's folder; None if there is none or it cannot be read."""
     try:
-        return RunState(**json.loads((folder / STATE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        state = RunState(**read_json((folder / STATE).read_bytes()))
+        texts = (state.engine, state.clock, *state.buses, *state.buses.values())
+        return state if isinstance(state.pid, int) and all(isinstance(text, str) for text in texts) else None
+    except (OSError, ValueError, TypeError, AttributeError):
         return None
 
 

@@ -47,7 +47,7 @@ def echelon(
 ) -> subprocess.CompletedProcess[str]:
     """Runs the command in a folder, as a user does."""
     return subprocess.run(
-        [COMMAND, *map(str, arguments)], cwd=folder, env=env, capture_output=True, text=True, timeout=200
+        [COMMAND, *map(str, arguments)], cwd=folder, env=env, capture_output=True, text=True, timeout=600
     )
 
 
@@ -154,7 +154,7 @@ def test_installed_parts_are_used_by_name(tmp_path: Path) -> None:
         target,
         distribution,
     ]
-    subprocess.run(pip, check=True, capture_output=True, timeout=200)
+    subprocess.run(pip, check=True, capture_output=True, timeout=600)
     env = os.environ | {"PYTHONPATH": str(target)}
     folder = tmp_path / "mine"
     folder.mkdir()

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from echelon.bridge.can.bus_url import interface_is_up
+from support.notice import say_not_tested
 from support.vcan import vcan_required
 
 ROOT = Path(__file__).parents[1]
@@ -27,17 +28,6 @@ LIMIT_S = 1500
 
 if interface_is_up("vcan0"):
     pytest.skip("vcan0 is up: tests/vcan runs without a guest", allow_module_level=True)
-
-
-class Notice:
-    """Tells at the end of the run what was not tested; a line in the list of skips is easily overlooked."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        terminalreporter.section("NOT TESTED: real vcan", red=True, bold=True)
-        terminalreporter.line(self.text)
 
 
 def read_report(path: Path) -> dict[str, str]:
@@ -71,7 +61,7 @@ def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         why = f"no vcan can be had here: {run.stderr.strip()}"
         if vcan_required():
             pytest.fail(why)
-        request.config.pluginmanager.register(Notice(f"{len(NAMES)} tests of CAN frames on a real interface. {why}"))
+        say_not_tested(request.config, "real vcan", f"{len(NAMES)} tests of CAN frames on a real interface. {why}")
         pytest.skip(why)
     if not report.exists():
         pytest.fail(f"exit status {run.returncode}\n{run.stdout}\n{run.stderr}")

@@ -41,8 +41,8 @@ class _Federate(BlockingPorts):
     def receive(self, channel: str) -> list[bytes]:
         wanted = float(self._ticks[channel] * _STEPS + _OFFSET[channel])
         self._ticks[channel] += 1
-        while self._request(self._federate, wanted) < wanted:
-            pass
+        granted = self._request(self._federate, wanted)
+        assert granted == wanted, (granted, wanted)
         return [bytes(self._get(one)) for one in self._inputs[channel]]
 
 
@@ -64,6 +64,8 @@ def _federate(name: str, role: Role, ticks: int, folder: Path) -> None:
     helics.helicsFederateInfoSetCoreTypeFromString(info, "ipc")
     helics.helicsFederateInfoSetCoreInitString(info, f"--broker_address={name} --federates=1 --loglevel=error")
     helics.helicsFederateInfoSetTimeProperty(info, helics.HELICS_PROPERTY_TIME_DELTA, 1.0)
+    # a role waits for all of its inputs in one request; without this flag each value that comes before wakes it
+    helics.helicsFederateInfoSetFlagOption(info, helics.HELICS_FLAG_UNINTERRUPTIBLE, True)
     federate = helics.helicsCreateValueFederate(f"{name}{role.name}", info)
     sends, receives = _channels(role)
     publications = {

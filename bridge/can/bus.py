@@ -2,11 +2,11 @@
 
 All frames are classic CAN frames with 11-bit identifiers. A bus does not receive the frames that it sent itself.
 
-On udp_multicast, groups with the same port on one host hear each other. So two buses need two ports. The datagrams do not
-leave the host.
+On udp_multicast, programs that use python-can hear all groups with the same port. So two buses need two ports. Only datagrams
+of this host are taken, and ours do not leave it.
 
-Only this module and bridge.can.wires use python-can. It opens the buses and defines the format of a datagram. Its send()
-and recv() take several times as long as the system call, so this module reads and writes the sockets directly.
+Only this module and bridge.can.wires use buses of python-can: those inside one process, and the format of a datagram. Its
+send() and recv() take several times as long as the system call, so this module reads and writes the sockets itself.
 """
 
 import errno
@@ -19,13 +19,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import can
-from can.interfaces.socketcan import SocketcanBus
 
-from echelon.bridge.can.bus_url import Address, parse
-from echelon.bridge.can.wires import Datagrams, RawCan, Wire, enlarge_buffers
+from echelon.bridge.can.bus_url import parse
+from echelon.bridge.can.guard import Guard
+from echelon.bridge.can.wires import Datagrams, Outside, RawCan, Wire
 
 _STAMP = struct.Struct("@ll")  # struct timespec, as SO_TIMESTAMPNS returns it
 _STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)
+_SO_MEMINFO = 55
+_MEMINFO = struct.Struct("@9I")  # the kernel's notes about a socket (linux/sock_diag.h); the last one counts drops
 _TRIES = 10
 _AT_ONCE = int(socket.MSG_DONTWAIT)
 _PAUSE = 0.0005  # [s]; _TRIES pauses: a full queue delays the caller by 5 ms at most
@@ -33,15 +35,21 @@ _SKEW_NS = 1_000_000
 """Time stamps may run backwards by less than this; the later frame then gets the stamp of the one before it.  Processors
 stamp frames of several senders in parallel, some microseconds before the frames enter the common queue."""
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
+_JUNK = 1000
+"""Datagrams in a row that are no frames, after which receiving gives up for once: a flood of them keeps nobody for ever"""
+_LOST_MS = 100
+"""How often a receiver that waits tries to come back to an interface that was removed"""
 
 
 class Received(NamedTuple):
-    """A frame from the bus: identifier, data, time of arrival [ns since 1970], and whether it is a remote frame."""
+    """A frame from the bus: identifier, data, time of arrival [ns since 1970], whether it is a remote frame, and the address of
+    its sender (None where frames have none)."""
 
     can_id: int
     data: bytes
     time_ns: int
     remote: bool
+    sender: tuple[Any, ...] | None = None
 
 
 @dataclass(slots=True)
@@ -60,67 +68,61 @@ class BusCounts:
     """Errors while receiving"""
 
 
-def open_bus(url: str) -> "Bus":
-    """Opens a bus. Raises ValueError for an invalid URL, and OSError if the bus cannot be opened."""
+def open_bus(url: str, own: frozenset[int] = frozenset()) -> "Bus":
+    """Opens a bus.  `own` are identifiers that nobody else may send; `Bus.guard` counts who does.
+
+    Raises ValueError for an invalid URL, and OSError if the bus cannot be opened."""
     address = parse(url)
-    options: dict[str, dict[str, Any]] = {
-        "socketcan": {"ignore_rx_error_frames": True},
-        "udp_multicast": {"port": address.port, "hop_limit": 0, "fd": False},
-        # the bound keeps a queue that nobody reads from growing forever
-        "virtual": {"preserve_timestamps": True, "rx_queue_size": 1 << 16},
-    }
+    outside = None
     try:
-        bus = can.Bus(
-            interface=address.interface,
-            channel=address.channel,
-            ignore_config=True,
-            can_filters=[{"can_id": 0, "can_mask": 0, "extended": False}],
-            **options[address.interface],
-        )
+        if address.interface == "virtual":
+            # the bound keeps a queue that nobody reads from growing forever
+            plain = can.Bus(
+                interface="virtual",
+                channel=address.channel,
+                ignore_config=True,
+                preserve_timestamps=True,
+                rx_queue_size=1 << 16,
+            )
+            return Bus(str(address), plain)
+        if address.interface == "socketcan":
+            return Bus(str(address), RawCan.open(address.channel), own=own)
+        wire = Datagrams(address.channel, address.port)
         try:
-            wire = _wire(bus, address)
+            outside = Outside(address.channel, address.port) if own else None
         except OSError:
-            bus.shutdown()
+            wire.close()
             raise
     except (can.CanError, OSError) as error:
         cause = error.__cause__ or error
         raise OSError(f"cannot open CAN bus {address}: {cause}") from error
-    return Bus(bus, str(address), wire)
-
-
-def _wire(bus: can.BusABC, address: Address) -> Wire | None:
-    if isinstance(bus, SocketcanBus):
-        wire: Wire = RawCan(bus.socket, address.channel)
-    elif address.interface == "udp_multicast":
-        wire = Datagrams(bus.fileno(), address.channel, address.port)
-    else:
-        return None
-    for one in {wire.into, wire.out}:
-        enlarge_buffers(one)
-    return wire
+    return Bus(str(address), wire, own=own, outside=outside)
 
 
 class Bus:
     """An open bus. Errors on the bus do not raise: `counts` counts them, and `error` keeps the last one."""
 
-    __slots__ = ("_bus", "_last_ns", "_message", "_sleep", "_tries", "_wire", "counts", "error", "url")
+    __slots__ = ("_last_ns", "_message", "_plain", "_sleep", "_tries", "_wire", "counts", "error", "guard", "url")
 
     def __init__(
         self,
-        bus: can.BusABC,
         url: str,
-        wire: Wire | None = None,
+        via: Wire | can.BusABC,
         sleep: Callable[[float], None] = time.sleep,
+        own: frozenset[int] = frozenset(),
+        outside: Outside | None = None,
     ) -> None:
         self.url = url  # without `auto`, so that other processes open the same bus
         self.counts = BusCounts()
         self.error: Exception | None = None
-        self._bus = bus
+        self.guard = Guard(own, outside)
         self._sleep = sleep
         self._tries = _TRIES
         self._message = can.Message(is_extended_id=False)
         self._last_ns = 0  # the stamp of the last frame
-        self._wire = wire  # None: python-can itself sends and receives
+        # either sockets, or a bus of python-can, which itself sends and receives
+        self._wire = via if isinstance(via, Wire) else None
+        self._plain: Any = None if isinstance(via, Wire) else via
 
     @property
     def channel(self) -> str:
@@ -144,7 +146,7 @@ class Bus:
         message.is_remote_frame = remote
         message.timestamp = time_ns * 1e-9
         try:
-            self._bus.send(message, timeout=_TRIES * _PAUSE if self._tries > 1 else 0)
+            self._plain.send(message, timeout=_TRIES * _PAUSE if self._tries > 1 else 0)
         except (can.CanError, OSError) as error:
             self.error = error
             if isinstance(error, can.CanTimeoutError) or _errno(error) in _FULL:
@@ -168,7 +170,7 @@ class Bus:
             self.error = error
             if error.errno in _FULL:
                 self._sleep(_PAUSE)
-            elif not wire.mend(error.errno):
+            elif not wire.mend(error.errno):  # the frame is lost, and perhaps the interface
                 self.counts.failed += 1
                 return False
             if left:
@@ -191,14 +193,15 @@ class Bus:
         return False
 
     def recv(self, timeout: float | None = 0.0) -> Received | None:
-        """Returns the next frame, or None if none came within `timeout` [s] or receiving failed.
+        """Returns the next frame, or None if none came within `timeout` [s] or receiving failed.  What is no frame is counted
+        and passed over.
 
         `timeout` None waits for ever."""
         if self._wire is not None:
             return self._recv_raw(self._wire, timeout)
         while True:
             try:
-                message = self._bus.recv(timeout)
+                message = self._plain.recv(timeout)
             except (can.CanError, OSError) as error:
                 self.error = error
                 self.counts.recv_failed += 1
@@ -212,7 +215,10 @@ class Bus:
             return Received(message.arbitration_id, data, round(message.timestamp * 1e9), message.is_remote_frame)
 
     def _recv_raw(self, wire: Wire, timeout: float | None) -> Received | None:
+        if wire.lost:
+            wire.mend(errno.ENODEV)
         deadline_s = None  # set at the first wait, which saves the clock call if a frame is there already
+        junk = 0
         while True:
             try:
                 payload, stamps, _, address = wire.into.recvmsg(wire.size, _STAMP_SPACE, _AT_ONCE)
@@ -224,16 +230,23 @@ class Bus:
                         return None
                 poll = select.poll()
                 poll.register(wire.into, select.POLLIN)
-                poll.poll(None if deadline_s is None else (deadline_s - now_s) * 1e3)
+                wait_ms = None if deadline_s is None else (deadline_s - now_s) * 1e3
+                if wire.lost and not wire.mend(errno.ENODEV):  # nothing wakes a socket whose interface is gone
+                    wait_ms = _LOST_MS if wait_ms is None else min(wait_ms, _LOST_MS)
+                poll.poll(wait_ms)
                 continue
             except OSError as error:
+                wire.mend(error.errno)
                 self._recv_failed(error)
                 return None
             try:
-                frame = wire.decode(payload, address)
+                frame = wire.decode(payload)
             except Exception as error:  # python-can raises all kinds of errors for a foreign datagram
                 self._recv_failed(error)
-                return None
+                junk += 1
+                if junk == _JUNK:
+                    return None
+                continue  # a frame may be right behind it: None would mean that there is none
             if frame is None:
                 continue
             can_id, data, remote = frame
@@ -243,24 +256,35 @@ class Bus:
                 time_ns = self._last_ns
             self._last_ns = time_ns
             self.counts.received += 1
-            return Received(can_id, data, time_ns, remote)
+            return Received(can_id, data, time_ns, remote, address)
 
     def _recv_failed(self, error: Exception) -> None:
         self.error = error
         self.counts.recv_failed += 1
 
+    @property
+    def missed(self) -> int:
+        """Number of frames that came and were lost, since nobody read them in time.  On a multicast bus datagrams that the bus
+        does not take count, too."""
+        if self._wire is None:
+            return 0
+        notes = self._wire.into.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        drops: int = _MEMINFO.unpack(notes)[-1]
+        return drops
+
     def fileno(self) -> int:
         """Returns the file descriptor that is readable when a frame is there. Raises OSError on a virtual bus."""
-        try:
-            return self._bus.fileno()
-        except NotImplementedError as error:
-            raise OSError(f"{self.url} has no file descriptor") from error
+        if self._wire is None:
+            raise OSError(f"{self.url} has no file descriptor")
+        return self._wire.into.fileno()
 
     def close(self) -> None:
         """Closes the bus."""
+        self.guard.close()
         if self._wire is not None:
             self._wire.close()
-        self._bus.shutdown()
+        else:
+            self._plain.shutdown()
 
     def __enter__(self) -> Self:
         return self

@@ -45,10 +45,13 @@ def resolve_url(url: str, number: int = 0) -> str:
     All processes that share the bus get this URL. `number` is the number of the bus in the plan: for bus 1, `auto` tries vcan1
     instead of vcan0, and so on. Raises ValueError for an invalid URL."""
     if url == "auto" and number:
-        return resolve_url(
-            f"socketcan:vcan{number}" if interface_is_up(f"vcan{number}") else f"udp_multicast::{_free_port()}"
-        )
+        return f"socketcan:vcan{number}" if interface_is_up(f"vcan{number}") else free_multicast_url()
     return str(parse(url))
+
+
+def free_multicast_url() -> str:
+    """Returns the URL of a multicast bus on a port that nobody uses."""
+    return str(parse(f"udp_multicast::{_free_port()}"))
 
 
 def why_no_multicast(group: str = DEFAULT_GROUP) -> str | None:

@@ -1,23 +1,21 @@
-"""`can.log`, the record of all frames of a run: writing and reading.
+"""`can.log`, the record of all frames of a run: writing it.  `bridge.can.log_files` reads logs.
 
 The format is that of `candump -l`, which log2asc, canplayer, `cantools decode` and python-can's LogReader read:
 
-    (1700000000.010000) vcan0 101#E80324FA010700F3
+    (1000000000.010000) can0 101#E80324FA010700F3
 """
 
 import os
-import re
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Final, Self
 
-from echelon.bridge.protocols.frame import Frame
-
+EPOCH_NS: Final = 1_000_000_000 * 1_000_000_000
+"""Run time 0 on the clock of can.log [ns]: 9 September 2001, 01:46:40 UTC.  The last digits are run time.  The clock does not
+begin at 0, since log2asc takes the first second of 1970 for no time at all."""
 FLUSH_NS = 100_000_000  # how old lines get before they are written; a killed process loses at most twice this
 _MAX_LINES = 4096
-_LINE = re.compile(r"\((\d+)\.(\d{6})\) (\S+) ([0-9A-F]{3})#(?:(R)[0-8]?|((?:[0-9A-F]{2}){0,8}))(?: [RT])?")
 
 
 @dataclass(slots=True)
@@ -41,7 +39,7 @@ class CanLog:
 
     __slots__ = ("_channel", "_epoch_ns", "_fd", "_flushed_ns", "_lines", "_size", "counts", "error")
 
-    def __init__(self, path: Path, channel: str, epoch_ns: int) -> None:
+    def __init__(self, path: Path, channel: str, epoch_ns: int = EPOCH_NS) -> None:
         if channel.split() != [channel]:
             raise ValueError(f"the channel must be one word, not {channel!r}")
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
@@ -123,29 +121,3 @@ class CanLog:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-class Logged(NamedTuple):
-    """A frame in a log: time stamp [ns], name of the bus, frame."""
-
-    time_ns: int
-    channel: str
-    frame: Frame
-
-
-def read_log(path: Path) -> Iterator[Logged]:
-    """Yields the classic frames with 11-bit identifiers of a log in candump's format; skips all other lines.
-
-    Raises OSError if the log cannot be read."""
-    with path.open(encoding="ascii", errors="replace") as lines:
-        yield from read_lines(lines)
-
-
-def read_lines(lines: Iterable[str]) -> Iterator[Logged]:
-    """Yields the frames of lines of a log, as `read_log` does."""
-    for line in lines:
-        if match := _LINE.fullmatch(line.strip()):
-            seconds, micros, channel, identifier, remote, data = match.groups()
-            time_ns = int(seconds) * 1_000_000_000 + int(micros) * 1000
-            frame = Frame(int(identifier, 16) & 0x7FF, bytes.fromhex(data or ""), remote is not None)
-            yield Logged(time_ns, channel, frame)

@@ -78,6 +78,16 @@ def cyclic_of(robot: RobotPlan, observer: Observer, closed: bool) -> dict[int, i
     return {frame.can_id: robot.period_ns for frame in make_host(robot).mirror(0.0, 0.0, True)}
 
 
+def run_identifiers(plan: Plan, bus: int) -> frozenset[int]:
+    """Returns the identifiers of all frames on a bus that bridge and drives may send."""
+    found: set[int] = set()
+    for robot in plan.robots:
+        if robot.drive.bus == bus:
+            protocol = protocol_of(robot)
+            found |= protocol.shared_identifiers().union(*map(protocol.identifiers, robot.drive.node_ids))
+    return frozenset(found)
+
+
 class SharedProtocol(NamedTuple):
     """A protocol in use on a bus.
 

@@ -26,7 +26,7 @@ from typing import Final
 
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.referee.wheel_check import WheelCheck
-from echelon.bridge.reports import TimingReport
+from echelon.bridge.referee_reports import TimingReport
 from echelon.bridge.timing.bus_load import worst_case_bits
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan

@@ -23,18 +23,15 @@ commands, one per acceleration period.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Final
 
-from echelon.bridge.can.canlog import Logged, read_log
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.observe import Finding, Observer
 from echelon.bridge.protocols.registry import protocol_of, shared_cyclic
 from echelon.bridge.referee.deadlines import BusTraffic
 from echelon.bridge.referee.wheel_check import WheelCheck
-from echelon.bridge.reports import FindingReport, RefereeReport
+from echelon.bridge.referee_reports import FindingReport, RefereeReport
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 
@@ -66,8 +63,11 @@ class Referee:
         self.kept: list[FindingReport] = []
         """The first findings"""
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
-        self._late = late
+        self.late = late
         self._silence_ns = plan.can.watchdog_ns
+        self._torn = self._was_torn = False
+        self._blind_until_ns = -NEVER_NS
+        self._blind_ns = max((robot.memory_ns for robot in self.robots), default=0)
         self._buses = [BusTraffic(plan, bus) for bus in range(len(plan.can.buses))]
         for robot in self.robots:
             traffic = self._buses[robot.plan.drive.bus]
@@ -94,6 +94,8 @@ class Referee:
             raise ValueError(f"bus must be 0 .. {len(self._buses) - 1}, not {bus!r}")
         traffic = self._buses[bus]
         self.frames += 1
+        if self._torn:
+            self._begin_anew(time_ns)
         said: list[Finding] = []
         if time_ns < traffic.last_ns:
             text = f"{(traffic.last_ns - time_ns) / 1e6:g} ms before the frame before it"
@@ -120,7 +122,7 @@ class Referee:
         for robot in deadline.robots:
             found = robot.observer.observe(time_ns, frame)
             for finding in found:
-                unheard = self._late and deadline.frames == 1 and finding.kind == "enabled unasked"
+                unheard = self.late and deadline.frames == 1 and finding.kind == "enabled unasked"
                 waited = finding.kind == "torque after silence" and not robot.silent(sampled_ns)
                 if not unheard and not waited:
                     said.append(self._tell(bus, robot, finding))
@@ -134,10 +136,26 @@ class Referee:
             said.append(self._tell(bus, deadline.robot, Finding(time_ns, frame.can_id, *untimely)))
         return said
 
+    def tear(self) -> None:
+        """Says that frames were on the buses that the referee does not get, for example since a line of a log is damaged.
+
+        What may come of that is no finding.  So it finds nothing until it knows again what went before."""
+        self._torn = self._was_torn = True
+
+    def _begin_anew(self, time_ns: int) -> None:
+        """Forgets when frames are due, and finds nothing for a while."""
+        self._torn = False
+        self._blind_until_ns = time_ns + self._blind_ns
+        for traffic in self._buses:
+            for deadline in traffic.deadlines.values():
+                deadline.forget()
+
     def finish(self, time_ns: int) -> list[Finding]:
         """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came."""
         said: list[Finding] = []
         time_ns = max(time_ns, *(traffic.last_ns for traffic in self._buses))
+        if self._torn:
+            self._begin_anew(time_ns)
         for traffic in self._buses:
             if time_ns > traffic.last_ns + traffic.pause_ns:
                 traffic.busy_ns = time_ns
@@ -154,6 +172,7 @@ class Referee:
                 if (
                     not deadline.period_ns
                     or deadline.frames
+                    or self._was_torn
                     or time_ns - begin_ns < 2 * deadline.period_ns + deadline.half_ns
                 ):
                     continue
@@ -200,6 +219,8 @@ class Referee:
                 yield self._tell(bus, deadline.robot, Finding(time_ns, deadline.can_id, "silent", text))
 
     def _tell(self, bus: int, robot: WheelCheck | None, finding: Finding) -> Finding:
+        if finding.time_ns < self._blind_until_ns:
+            return finding
         self.kinds[finding.kind] += 1
         if len(self.kept) < KEPT:
             self.kept.append(
@@ -213,37 +234,3 @@ class Referee:
                 )
             )
         return finding
-
-
-def judge_log(
-    path: Path, plan: Plan, *, tolerance_ns: int | None = None, whole: bool = True, until_ns: int | None = None
-) -> RefereeReport:
-    """Returns the referee's report on the can.log of a run.
-
-    `whole` says that the run was not cut off: then cyclic frames that are missing at the end of the log are silence.  Of a run
-    that was stopped, only frames up to `until_ns` are judged: some processes go on for a while, others do not.
-    Raises OSError if the log cannot be read."""
-    referee = Referee(plan, tolerance_ns=tolerance_ns)
-    last_ns = later = 0
-    for time_ns, bus, frame in read_run_log(path, plan):
-        if until_ns is None or time_ns <= until_ns:
-            last_ns = time_ns
-            referee.observe(time_ns, bus, frame)
-        else:
-            later += 1
-    referee.finish(max(last_ns, plan.duration_ns) if whole else last_ns)
-    return replace(referee.report(), until=None if until_ns is None else until_ns / 1e9, later=later)
-
-
-def read_run_log(path: Path, plan: Plan) -> Iterator[tuple[int, int, Frame]]:
-    """Yields run time [ns], number of the bus and frame from a run's can.log; skips buses that the plan does not have."""
-    return of_run(read_log(path), plan)
-
-
-def of_run(logged: Iterable[Logged], plan: Plan) -> Iterator[tuple[int, int, Frame]]:
-    """Yields run time [ns], number of the bus and frame of logged frames; skips buses that the plan does not have."""
-    numbers = {bus.name: number for number, bus in enumerate(plan.can.buses)}
-    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
-    for time_ns, channel, frame in logged:
-        if (number := numbers.get(channel)) is not None:
-            yield time_ns - start_ns, number, frame

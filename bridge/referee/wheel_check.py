@@ -35,6 +35,11 @@ class WheelCheck:
         self._windows = [Extremes(window_ns) for _ in WHEELS] if self.envelope.window_limit < inf else []
         self._begin_ns: int | None = None
 
+    @property
+    def memory_ns(self) -> int:
+        """For how long a command can be part of a finding [ns]."""
+        return max(self._effect_ns, _WINDOW_NS) + 2 * self.plan.drive.period_ns
+
     def silent(self, time_ns: int) -> bool:
         """Returns whether at this time some wheel has had no command for its watchdog and a period."""
         wait_ns = self.plan.drive.watchdog_ns + self.plan.drive.period_ns

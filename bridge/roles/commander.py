@@ -75,7 +75,7 @@ class RobotChannel:
             self._came_up_ns = time_ns
         tau_right = tau_left = 0.0
         limited = False
-        if heard is None or (values := heard.values.tolist())[_COMMANDED] != 1.0:
+        if heard is None or heard.is_null or (values := heard.values.tolist())[_COMMANDED] != 1.0:
             self.envelope.stop(time_ns)
             if self.spoken or time_ns >= self.robot.drive.watchdog_ns:  # no robot has spoken yet when a run begins
                 self.stopped[NOT_COMMANDED] += 1
@@ -104,15 +104,15 @@ class RobotChannel:
     def stop(self, time_ns: int) -> tuple[list[Frame], str]:
         """Returns frames that take the torque away and disable the drives, and a text that says what failed.
 
-        If the host of a user's own protocol fails at `stop`, the frames only command zero torque; if `mirror` fails, too, there
-        are none.  The text is empty if nothing failed."""
+        If a host fails at `stop`, the frames only command zero torque; if `mirror` fails, too, there are none.  The text is
+        empty if nothing failed.  Nothing is raised: the other robots must be stopped, too."""
         try:
             return self.host.stop(time_ns), ""
-        except PartRunError as error:
-            failure = str(error)
+        except Exception as error:
+            failure = str(error) if isinstance(error, PartRunError) else f"{type(error).__name__}: {error}"
         try:
             return self.host.mirror(0.0, 0.0, False), failure
-        except PartRunError:
+        except Exception:
             return [], failure  # now only the drives' own watchdogs take the torque away
 
     def report(self) -> WheelsReport:
@@ -151,6 +151,7 @@ class Commander:
         self._longest_ns = [-(-worst_case_bits(8) * 1_000_000_000 // bus.bitrate) for bus in plan.can.buses]
         self._masters = make_masters(plan)
         self._places = drive_places(plan)
+        self._nodes = {(place.bus, place.node) for place in self._places}
         self._estops = Schedule(event for event in plan.events if event.kind == "estop")
         self._stopped: set[int] = set()
         """Numbers of the robots under an e-stop"""
@@ -170,7 +171,7 @@ class Commander:
         """The stage hear: takes the drives' frames of this instant; returns the torques of all wheels."""
         for message in heard:
             for at_ns, bus, node, frame in _fresh(message, time_ns):
-                if at_ns != time_ns or bus >= len(self.buses):
+                if at_ns != time_ns or (bus, node) not in self._nodes:
                     self.refused["frame of no drive"] += 1
                     continue
                 model = self.buses[bus]

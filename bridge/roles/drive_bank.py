@@ -82,6 +82,8 @@ class DriveBank:
         self.refused: Counter[str] = Counter()
         """Impossible values in messages, counted by reason"""
         self._events_ns = drives.first_ns - 1
+        self.next_ns = drives.first_ns
+        """End of the last period that was served"""
         self._of_robot: list[list[PlacedDrive]] = [[] for _ in plan.robots]
         for placed in self.drives:
             self._of_robot[placed.place.robot].append(placed)
@@ -109,6 +111,7 @@ class DriveBank:
 
     def _serve(self, time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
         """The stage serve: gives the drives the frames that the buses carry until the next report."""
+        self.next_ns = time_ns + self._period_ns
         frames, *robots = heard
         for message in robots:
             if message is not None:
@@ -145,7 +148,9 @@ class DriveBank:
         return any(motor.torque != 0.0 for placed in self.drives for motor in placed.drive.motors)
 
     def turn(self, time_ns: int, message: Message) -> None:
-        """Sets the wheel speeds of a robot from its message."""
+        """Sets the wheel speeds of a robot from its message; a null message changes nothing."""
+        if message.is_null:
+            return
         for placed in self._of_robot[message.source]:
             placed.outbox += placed.drive.advance(time_ns)  # everything before happens at the old speed
             for motor, wheel in zip(placed.drive.motors, placed.place.wheels, strict=True):

@@ -56,6 +56,8 @@ class Envelope:
         self.rejections: Counter[Rejection] = Counter()
         self._clock_ns = -math.inf
         self._wheels = _Wheel(plan), _Wheel(plan)
+        limits = plan.torque_limit, plan.rise_limit, plan.fall_limit, plan.window_limit
+        self._unlimited = all(limit == math.inf for limit in limits)
 
     def check(self, now_ns: int, command_ns: int, tau_right: float, tau_left: float) -> Verdict:
         """Returns the torques to send at `now_ns` if `tau_right` and `tau_left` [N m] were commanded at `command_ns`."""
@@ -84,6 +86,8 @@ class Envelope:
             return Rejection.STALE
         if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
             return Rejection.NOT_FINITE
+        if self._unlimited:
+            return None
         right, left = self._wheels
         return right.rejection(now_ns, tau_right) or left.rejection(now_ns, tau_left)
 

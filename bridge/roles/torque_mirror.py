@@ -114,6 +114,16 @@ class TorqueMirror:
             self._envelopes[robot].stop(counts.last_ns)
         return self._send(robot, self._hosts[robot].mirror(0.0, 0.0, False))
 
+    def end(self) -> list[tuple[int, Frame]]:
+        """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot.  They are
+        not counted, since no state has caused them."""
+        return [
+            (robot, frame)
+            for robot, counts in enumerate(self.counts)
+            if counts.frames
+            for frame in self._hosts[robot].mirror(0.0, 0.0, False)
+        ]
+
     def _send(self, robot: int, frames: list[Frame]) -> list[Frame]:
         counts = self.counts[robot]
         counts.frames += len(frames)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus import Bus
 from echelon.bridge.can.bus_url import listen_command
 from echelon.bridge.can.canlog import CanLog
 from echelon.bridge.frame_message import TimedFrame, frames_of
@@ -13,6 +13,7 @@ from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.reports import BridgeProgress, CanReport, WheelsReport, stopped_text
 from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.stations.guarding import intrusions, open_guarded
 from echelon.bridge.stations.rail import Rail, on_bus
 from echelon.bridge.timing.buses import bus_report, scheduled
 from echelon.bridge.timing.fit import plan_fit
@@ -22,6 +23,9 @@ from echelon.plan.plan import Plan
 from echelon.role import Stage
 
 LOG: Final = "can.log"
+STOP_S: Final = 0.2
+"""How long frames that stop wheels are tried on a bus that is full [s]"""
+PAUSE_S: Final = 0.001
 
 
 class ClosedBridge(Bridge):
@@ -37,15 +41,14 @@ class ClosedBridge(Bridge):
         self.plan = plan
         self.role = role or Commander(plan)
         self.index = self.role.index
-        self.buses: list[Bus] = [open_bus(url) for url in urls]
+        self.buses: list[Bus] = open_guarded(plan, urls)
         self.urls = [bus.url for bus in self.buses]
         self.url = ", ".join(self.urls) or "nowhere"
         self.rail = Rail(self.buses)
         for bus, name in enumerate(dbc_names(plan)):
             (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
-        # the log begins with the bring-up of the drives; run time 0 is `can.bring_up` later
         self._names = [bus.name for bus in plan.can.buses]
-        self._log = CanLog(folder / LOG, self._names[0], plan.can.bring_up_ns)
+        self._log = CanLog(folder / LOG, self._names[0])
         self.frames = 0
         self._robots: dict[str, WheelsReport] = {}
         self.stages: tuple[Stage, ...] = self.role.stages
@@ -77,13 +80,18 @@ class ClosedBridge(Bridge):
         """Does the same as `stop`, at run time `time_ns`.  The frames do not wait in the models of the buses.
 
         Raises PartRunError afterwards if a user's own protocol failed at it."""
-        self._robots = self.role.reports()
-        frames, failure = self.role.stop(time_ns)
-        for _, bus, _, (can_id, data, remote) in frames if self.buses else ():
-            self.buses[bus].send(can_id, data, time_ns, remote)
+        frames, failure = self.send_stop(time_ns)
         self.log(frames)
         if failure:
             raise PartRunError(failure)
+
+    def send_stop(self, time_ns: int) -> tuple[list[TimedFrame], str]:
+        """Sends the frames that stop all wheels, without any other work; returns those sent, and what failed in words.
+
+        A bus that is full takes them within `STOP_S`, or not at all; then the drives' own watchdogs take the torque away."""
+        self._robots = self.role.reports()
+        frames, failure = self.role.stop(time_ns)
+        return (send_all(self.buses, frames) if self.buses else frames), failure
 
     def interrupt(self) -> None:
         """Ends any waiting for a bus that accepts no frames."""
@@ -97,6 +105,8 @@ class ClosedBridge(Bridge):
 
     def progress(self) -> BridgeProgress:
         """Returns the present state, for a live table."""
+        for one in self.buses:
+            one.guard.look_outside()
         return BridgeProgress(
             url=self.url,
             load=max(bus.load for bus in self.role.buses),
@@ -132,5 +142,20 @@ class ClosedBridge(Bridge):
             log_error=str(self._log.error) if self._log.error else None,
             robots=self._robots or self.role.reports(),
             foreign=self.rail.foreign,
+            intrusions=intrusions(self.plan, self.buses),
             refused=dict(self.role.refused),
         )
+
+
+def send_all(buses: Sequence[Bus], frames: Sequence[TimedFrame]) -> list[TimedFrame]:
+    """Sends frames that stop wheels: each of them, again and again while its bus is full, for `STOP_S` in all.
+
+    Returns those that were sent."""
+    sent, until_s = [], time.monotonic() + STOP_S
+    for timed in frames:
+        time_ns, bus, _, (can_id, data, remote) = timed
+        while not (taken := buses[bus].send(can_id, data, time_ns, remote)) and time.monotonic() < until_s:
+            time.sleep(PAUSE_S)
+        if taken:
+            sent.append(timed)
+    return sent

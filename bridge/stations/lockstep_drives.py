@@ -2,13 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
-from echelon.bridge.can.bus import open_bus
+from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.reports import BridgeProgress, DrivesReport
 from echelon.bridge.roles.drive_bank import DriveBank
+from echelon.bridge.stations.guarding import intrusions, open_guarded
 from echelon.bridge.stations.rail import Rail, on_bus
+from echelon.bridge.stations.waiting import drained
 from echelon.plan.plan import Plan
 from echelon.role import Stage
+
+STEPS: Final = 20
+"""Steps in which the time passes that the watchdogs take: what a drive sends in a step goes out together"""
 
 
 class LockstepDrives:
@@ -19,8 +25,9 @@ class LockstepDrives:
     def __init__(self, plan: Plan, urls: Sequence[str]) -> None:
         self._bank = DriveBank(plan)
         self.index = self._bank.index
-        self._buses = [open_bus(url) for url in urls]
+        self._plan, self._buses = plan, open_guarded(plan, urls)
         self._rail = Rail(self._buses)
+        self._rest_ns = 2 * max(robot.drive.watchdog_ns for robot in plan.robots)
         self.stages: tuple[Stage, ...] = on_bus(self._bank.stages, self._rail, is_bridge=False)
 
     def interrupt(self) -> None:
@@ -28,7 +35,19 @@ class LockstepDrives:
         self._rail.stopping.set()
 
     def stop(self) -> None:
-        """Does nothing: drives stop when the bridge commands it, or by their watchdog when it is silent."""
+        """Takes what the bridge has still sent, then lets the drives' watchdogs expire; sends what the drives report of it.
+
+        So who listens to the bus hears that the wheels have no torque, however the run ends."""
+        time_ns = self._bank.next_ns
+        frames = []
+        for number, bus in enumerate(self._buses):
+            for received in drained(bus):
+                frame = Frame(received.can_id, received.data, received.remote)
+                frames += self._bank.receive(time_ns, number, frame)
+        for step in range(1, STEPS + 1):
+            frames += self._bank.pass_time(time_ns + step * self._rest_ns // STEPS)
+        for at_ns, number, _, (can_id, data, remote) in frames:
+            self._buses[number].send(can_id, data, at_ns, remote)
 
     def progress(self) -> BridgeProgress:
         """Returns the present state, for a live table."""
@@ -36,7 +55,7 @@ class LockstepDrives:
 
     def report(self) -> DrivesReport:
         """Returns the report of all drives."""
-        return replace(self._bank.report(), foreign=self._rail.foreign)
+        return replace(self._bank.report(), foreign=self._rail.foreign, intrusions=intrusions(self._plan, self._buses))
 
     def close(self) -> None:
         """Closes the buses."""

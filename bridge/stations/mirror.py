@@ -7,15 +7,17 @@ from typing import Final
 
 import numpy as np
 
-from echelon.bridge.can.bus import open_bus
 from echelon.bridge.can.bus_url import listen_command
 from echelon.bridge.can.canlog import CanLog
-from echelon.bridge.frame_message import BRIDGE_NODE, add_words
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, add_words
 from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.protocols.registry import make_host
 from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped_text
 from echelon.bridge.roles.torque_mirror import TorqueMirror
 from echelon.bridge.stations.bridge import Bridge
+from echelon.bridge.stations.closed import send_all
+from echelon.bridge.stations.guarding import check_sender, intrusions, open_guarded
+from echelon.bridge.stations.waiting import AT_ONCE, RunClock, drained
 from echelon.bridge.timing.bus_load import bus_load
 from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
@@ -25,59 +27,103 @@ from echelon.plan.plan import Plan
 TAU_RIGHT: Final = STATE_FIELDS.index("tau_right")
 TAU_LEFT: Final = STATE_FIELDS.index("tau_left")
 SATURATED: Final = STATE_FIELDS.index("saturated")
+FLOOD: Final = 100 * AT_ONCE
+"""In virtual time, how many frames are read from a bus at once"""
 
 
 class MirrorBridge(Bridge):
     """A torque mirror with its buses, can.log and its DBC files.
 
+    In virtual time, frames and the lines of can.log have the times of the states.  On a wall clock (`clock`, which must be
+    replaced when the run starts) a frame goes out as soon as its state comes, whoever else is silent.  Its time is when it was
+    sent.  A state that is older than the watchdog makes no frame: such torques would come in a burst after a standstill.
+
     Raises ValueError for an invalid URL and OSError if a bus or a file cannot be opened."""
 
-    def __init__(self, plan: Plan, urls: Sequence[str], folder: Path) -> None:
+    def __init__(self, plan: Plan, urls: Sequence[str], folder: Path, clock: RunClock | None = None) -> None:
+        self.clock = clock
+        self._lost = [0] * len(plan.can.buses)
+        """For each bus, the number of states that were too old, and of frames that it did not take (wall clock)"""
+        self._old_ns = plan.can.watchdog_ns
         self._plan = plan
         self._mirror = TorqueMirror(
             [make_host(robot) for robot in plan.robots],
             [robot.period_ns for robot in plan.robots],
             [robot.envelope for robot in plan.robots],
         )
-        self._buses = [open_bus(url) for url in urls]
+        self._buses = open_guarded(plan, urls)
+        self._spoken: list[set[int]] = [set() for _ in plan.can.buses]
+        """For each bus, the identifiers that the bridge sends"""
+        for robot in plan.robots:
+            frames = make_host(robot).mirror(0.0, 0.0, False)
+            self._spoken[robot.drive.bus].update(frame.can_id for frame in frames)
         self.url = ", ".join(bus.url for bus in self._buses)
         for number, name in enumerate(dbc_names(plan)):
             (folder / name).write_text(plan_dbc(plan, number), encoding="utf-8")
-        self._log = CanLog(folder / "can.log", plan.can.buses[0].name, 0)
+        self._log = CanLog(folder / "can.log", plan.can.buses[0].name)
         self._bus_of = [robot.drive.bus for robot in plan.robots]
         self._names = [bus.name for bus in plan.can.buses]
         self._source = len(plan.formation)
         self._sequence = 0
         self._time_ns = 0
+        self._stopped = False
 
     def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Sends the torques in the robots' states; returns messages with the frames, one per instant.
+        """Sends the torques in the robots' states; returns messages with the frames: one per instant, or one on a wall clock.
 
         The state at run time 0 holds no torque.  So a robot's first frame comes at the end of its first period.
         """
         copies: list[Message] = []
+        if self._stopped:
+            return copies
         words: list[int] = []
-        buses, names, log, encode = self._buses, self._names, self._log, self._mirror.encode
+        buses, names, log, encode, clock = self._buses, self._names, self._log, self._mirror.encode, self.clock
         wall_ns = time.monotonic_ns()
         for channel, source, _, time_ns, values in messages:
             if channel is not Channel.STATE or time_ns == 0:
                 continue
-            if time_ns != self._time_ns:
+            number = self._bus_of[source]
+            if clock is not None:
+                self._time_ns = clock.now()
+                if self._time_ns - time_ns > self._old_ns:
+                    self._lost[number] += 1
+                    continue
+            elif time_ns != self._time_ns:
                 self._copy(words, copies)
                 self._time_ns = time_ns
             frames = encode(
                 time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
             )
-            number = self._bus_of[source]
+            sent_ns = self._time_ns
             for identifier, data, _ in frames:
-                buses[number].send(identifier, data, time_ns)
-                log.write(time_ns, identifier, data, wall_ns, names[number])
-                add_words(words, time_ns, number, BRIDGE_NODE, identifier, data)
+                if not buses[number].send(identifier, data, sent_ns) and clock is not None:
+                    self._lost[number] += 1
+                    continue
+                log.write(sent_ns, identifier, data, wall_ns, names[number])
+                add_words(words, sent_ns, number, BRIDGE_NODE, identifier, data)
         self._copy(words, copies)
         return copies
 
     def stop(self) -> None:
-        """Does nothing, since mirrored frames turn no wheel."""
+        """Takes the torque away from the wheels and disables their drives: drives on the bus obey mirrored frames, too.
+
+        After that nothing is sent any more."""
+        self._stopped = True
+        now_ns = None if self.clock is None else self.clock.now()
+        frames = [
+            # in virtual time each is due when the robot's next one would be
+            TimedFrame(
+                self._time_ns + self._plan.robots[robot].period_ns if now_ns is None else now_ns,
+                self._bus_of[robot],
+                BRIDGE_NODE,
+                frame,
+            )
+            for robot, frame in self._mirror.end()
+        ]
+        frames.sort(key=lambda timed: timed.time_ns)
+        wall_ns = time.monotonic_ns()
+        for time_ns, bus, _, (can_id, data, remote) in send_all(self._buses, frames):
+            self._log.write(time_ns, can_id, data, wall_ns, self._names[bus], remote)
 
     def flush(self) -> None:
         """Hands all lines of can.log to the operating system."""
@@ -91,6 +137,7 @@ class MirrorBridge(Bridge):
 
     def progress(self) -> BridgeProgress:
         """Returns the present state, for a live table."""
+        self._look()
         return BridgeProgress(
             url=self.url,
             load=max(self._loads()),
@@ -98,8 +145,18 @@ class MirrorBridge(Bridge):
             stopped=stopped_text([counts.stopped for counts in self._mirror.counts]),
         )
 
+    def _look(self) -> None:
+        """Counts what others send with identifiers of this run.  The bridge uses none of it.
+
+        In virtual time it reads on behind a flood, where the frames that matter may be."""
+        for bus, spoken in zip(self._buses, self._spoken, strict=True):
+            for received in drained(bus, FLOOD if self.clock is None else AT_ONCE):
+                check_sender(bus, spoken, received)
+            bus.guard.look_outside()
+
     def report(self) -> CanReport:
         """Returns the report of the run, with the load that the frames would make on real buses."""
+        self._look()
         loads, fit = self._loads(), plan_fit(self._plan)
         return CanReport(
             path="mirror",
@@ -113,7 +170,8 @@ class MirrorBridge(Bridge):
             fit=tuple(bus.lines[0] for bus in fit),
             advice=tuple(way for bus in fit for way in bus.advice),
             buses=tuple(
-                BusReport(bus.name, bus.bitrate, load) for bus, load in zip(self._plan.can.buses, loads, strict=True)
+                BusReport(bus.name, bus.bitrate, load, lost)
+                for bus, load, lost in zip(self._plan.can.buses, loads, self._lost, strict=True)
             ),
             scheduled=scheduled(self._plan),
             sent=sum(bus.counts.sent for bus in self._buses),
@@ -124,6 +182,7 @@ class MirrorBridge(Bridge):
             robots={
                 robot.name: self._mirror.report(robot.index, robot.drive.protocol.use) for robot in self._plan.robots
             },
+            intrusions=intrusions(self._plan, self._buses),
             messages=self._sequence,
         )
 

@@ -23,6 +23,8 @@ class PacedBus:
     def __init__(self, bus: Bus, model: BusModel, old_ns: int) -> None:
         self.bus, self.model = bus, model
         self._old_ns = old_ns
+        self.spoken: set[int] = set()
+        """Identifiers of the frames that this process has put on the bus"""
         self._seen = 0
 
     def send(self, time_ns: int, node: int, frame: Frame) -> bool:
@@ -46,6 +48,7 @@ class PacedBus:
                 self.model.traffic[can_id].expire()
             elif self.bus.send(can_id, data, remote=remote):
                 taken.append(sent)
+                self.spoken.add(can_id)
         events = self.model.events
         while self._seen < len(events):
             if events[self._seen].kind is BusEventKind.OFF:

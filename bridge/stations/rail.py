@@ -50,7 +50,8 @@ class Rail:
             self.waiting = ""
 
     def expect(self, frames: Sequence[TimedFrame]) -> None:
-        """Waits until the buses have carried these frames, in this order on each.  Raises BusError if one does not come."""
+        """Waits until the buses have carried these frames, in this order on each.  Raises BusError if one does not come, and
+        SystemExit if `stopping` is set meanwhile."""
         for timed in frames:
             self._await(timed)
 
@@ -58,17 +59,21 @@ class Rail:
         bus, wanted = self.buses[timed.bus], timed.frame
         deadline_s = time.monotonic() + LOST_AFTER_S
         while True:
-            received = bus.recv(max(0.0, deadline_s - time.monotonic()))
+            begun_s = time.monotonic()
+            received = bus.recv(max(0.0, min(RETRY_S, deadline_s - begun_s)))
             if received is None:
-                if (
-                    time.monotonic() < deadline_s
-                ):  # receiving failed, for example since the interface is down: try again
-                    self.stopping.wait(RETRY_S)
+                now_s = time.monotonic()
+                # receiving may have failed, for example since the interface is down: then it is not tried again at once
+                if self.stopping.wait(RETRY_S if now_s - begun_s < RETRY_S / 2 else 0.0):
+                    raise SystemExit(0)
+                if now_s < deadline_s:
                     continue
                 raise BusError(f"{bus.url} lost a frame: {wanted.can_id:03X}#{wanted.data.hex().upper()} did not come")
             if Frame(received.can_id, received.data, received.remote) == wanted:
                 return
             self.foreign += 1
+            if received.can_id in bus.guard.own:
+                bus.guard.count(received.sender, received.can_id)
 
 
 def on_bus(

@@ -5,13 +5,15 @@ import os
 import select
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, Final
 
 from echelon.bridge.can.bus import Bus, Received
-from echelon.messages import TORQUE_FIELDS, Channel, Message
+from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
-from echelon.runtime.wire import WireError, count_refusal, decode
+from echelon.runtime.admission import EARLY_NS, Admission, Refusals
+from echelon.runtime.admission_rules import admissions_into
 
 PROGRESS_NS: Final = 200_000_000
 """How often a process reports its progress and reads its orders; the longest sleep of `wait_for`."""
@@ -22,26 +24,29 @@ AT_ONCE: Final = 256
 class Mail:
     """A mailbox for the robots' torques.
 
-    Zenoh's thread calls `receive`, the bridge's or drives' thread calls `take`.  With `wakes`, `fileno` is readable while
-    messages are there.  `refused` counts invalid payloads by reason."""
+    Zenoh's thread calls the `doors`, the bridge's or drives' thread calls `take`.  With `wakes`, `fileno` is readable while
+    messages are there.  `refusals` counts what was refused."""
 
-    def __init__(self, plan: Plan, wakes: bool = True) -> None:
-        self._robots = len(plan.robots)
+    def __init__(self, plan: Plan, receiver: int, wakes: bool = True) -> None:
+        self.refusals = Refusals()
+        self.now: Callable[[], int] = lambda: EARLY_NS
+        """Returns the run time; to be replaced when the start of the run is known"""
+        self._admissions = [
+            each
+            for each in admissions_into(plan, receiver, self.refusals, virtual=False)
+            if each.channel is Channel.TORQUE
+        ]
         self._messages: deque[Message] = deque()
         self._wakes = wakes
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self.refused: dict[str, int] = {}
 
-    def receive(self, payload: bytes) -> None:
-        """Takes a message as bytes; an invalid one is counted and dropped."""
-        try:
-            message = decode(payload)
-            if message.channel is not Channel.TORQUE or message.source >= self._robots:
-                raise WireError("of no robot")
-            if message.values.size != len(TORQUE_FIELDS):
-                raise WireError("wrong number of values")
-        except WireError as error:
-            count_refusal(self.refused, error.reason)
+    def doors(self) -> dict[int, Callable[[bytes], None]]:
+        """Returns for each robot (by index) the function that takes its payloads."""
+        return {each.source: partial(self._receive, each) for each in self._admissions}
+
+    def _receive(self, admission: Admission, payload: bytes) -> None:
+        message = admission.admit(payload, self.now())
+        if message is None:
             return
         self._messages.append(message)
         if self._wakes:
@@ -61,9 +66,10 @@ class Mail:
         return self._wake
 
 
-def drained(bus: Bus) -> Iterator[Received]:
-    """Yields the frames that have come from a bus, at most `AT_ONCE`: a node that floods the bus must not block the caller."""
-    for _ in range(AT_ONCE):
+def drained(bus: Bus, most: int = AT_ONCE) -> Iterator[Received]:
+    """Yields the frames that have come from a bus, but not more than `most`: a node that floods the bus must not block the
+    caller."""
+    for _ in range(most):
         received = bus.recv(0.0)
         if received is None:
             return

@@ -20,18 +20,18 @@ from echelon.bridge.reports import BridgeProgress, CanReport, TorqueTimes
 from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.closed import ClosedBridge
+from echelon.bridge.stations.guarding import check_sender
 from echelon.bridge.stations.paced_bus import PacedBus
 from echelon.bridge.stations.waiting import Mail, RunClock, drained
 from echelon.bridge.timing.bus_load import BitCount
+from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan, on_wall_clock
 from echelon.runtime.fates import Fates
-from echelon.runtime.wire import count_refusal, encode, join
+from echelon.runtime.wire import encode, join
 
 FEEDBACK_SHARE: Final = 8
 """Robots get the torques of their wheels when all drives have reported, or after 1/FEEDBACK_SHARE of the period."""
-OLDEST_NS: Final = 10_000_000_000
-"""Messages older than this are refused."""
 OTHER_NODE: Final = 1
 """The node number of all frames from the bus: a frame does not say which drive sent it."""
 
@@ -53,13 +53,13 @@ class WallBridge(Bridge):
         self.plan = plan = on_wall_clock(plan)
         self._closed = ClosedBridge(plan, urls, folder, paired=True, role=Commander(plan, alone=True))
         self.url = self._closed.url
-        self.mail = Mail(plan)
         self._role = self._closed.role
         self._buses = [
             PacedBus(bus, model, plan.can.watchdog_ns)
             for bus, model in zip(self._closed.buses, self._role.buses, strict=True)
         ]
         assert plan.bridge is not None
+        self.mail = Mail(plan, plan.bridge.index)
         self._period_ns = plan.bridge.period_ns
         self._last: list[Message | None] = [None] * len(plan.robots)
         self._sent_in = [-1 << 62] * len(plan.robots)  # number of the period in which a robot's torque was last sent
@@ -83,6 +83,8 @@ class WallBridge(Bridge):
         self.clock = RunClock()
         self.in_time = 0
         self._messages = 0
+        self._stopped = False
+        """The wheels have been stopped, and nothing is sent any more"""
         self._tell_wheels, self._watch = tell_wheels, watch
 
     @property
@@ -111,6 +113,16 @@ class WallBridge(Bridge):
         self._carry(self.clock.now())
         self._pass_time(self.clock.now())
 
+    def faults_of_start(self) -> str:
+        """Returns in words which drives are in fault, if no event of the scenario has begun; empty if none is.
+
+        Until run time 0 the hosts clear faults and enable the drives again, as often as needed.  After that they do not, unless
+        `recover_after` is given, so a drive that missed its watchdog just then would give no torque in the whole run."""
+        if any(event.at_ns <= self.clock.now() for event in self.plan.events):
+            return ""
+        found = [one for one in self._role.robots if one.host.fault and one.robot.drive.recover_ns is None]
+        return ", ".join(f"{one.robot.name}: {one.host.fault}" for one in found)
+
     def take(self, messages: Sequence[Message]) -> list[Message]:
         """Does nothing, since torques come through `mail`."""
         return []
@@ -119,9 +131,6 @@ class WallBridge(Bridge):
         """Takes the robots' torques from `mail`, applies loss and delay of their links, and sends those that have arrived."""
         for message in self.mail.take():
             now_ns = self.clock.now()
-            if not self._plausible(now_ns, message):
-                count_refusal(self.mail.refused, "of another time")
-                continue
             copies = self._fates[message.source].of(message.sequence, message.time_ns)
             if not copies:
                 self.link_lost += 1
@@ -131,11 +140,6 @@ class WallBridge(Bridge):
                 heappush(self._flying, (message.time_ns + delay_ns, message.source, message.sequence, message))
         while self._flying and self._flying[0][0] <= self.clock.now():
             self._take(self.clock.now(), heappop(self._flying)[-1])
-
-    def _plausible(self, now_ns: int, message: Message) -> bool:
-        """Returns whether a message belongs to a period of this run that has begun and is not older than `OLDEST_NS`."""
-        age_ns = now_ns - message.time_ns
-        return message.time_ns == message.sequence * self._period_ns and -self._period_ns <= age_ns <= OLDEST_NS
 
     def _take(self, now_ns: int, message: Message) -> None:
         before = self._last[message.source]
@@ -150,6 +154,7 @@ class WallBridge(Bridge):
         for number, bus in enumerate(self._closed.buses):
             for received in drained(bus):
                 frame = Frame(received.can_id, received.data, received.remote)
+                check_sender(bus, self._buses[number].spoken, received)
                 came_ns = min(self.clock.of(received.time_ns), now_ns)  # by the kernel's time stamp
                 self._buses[number].hear(now_ns, frame, came_ns)
                 if not self._role.buses[number].is_off(BRIDGE_NODE):
@@ -185,6 +190,8 @@ class WallBridge(Bridge):
 
     def _carry(self, now_ns: int) -> None:
         """Sends the frames that the buses can have carried by now; measures the latency of torques."""
+        if self._stopped:
+            return
         for number, bus in enumerate(self._buses):
             for queued_ns, _, _, frame in bus.run(now_ns):
                 self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
@@ -199,11 +206,13 @@ class WallBridge(Bridge):
     def stop(self) -> None:
         """Takes the torque away from all wheels and disables their drives."""
         now_ns = self.clock.now()
-        try:
-            self._frames_from_buses(now_ns)
-            self._flush()
-        finally:
-            self._closed.stop_at(now_ns)
+        self._stopped = True
+        frames, failure = self._closed.send_stop(now_ns)
+        self._frames_from_buses(now_ns)
+        self._flush()
+        self._closed.log(frames)
+        if failure:
+            raise PartRunError(failure)
 
     def close(self) -> None:
         """Closes log and buses."""
@@ -224,7 +233,6 @@ class WallBridge(Bridge):
             buses=tuple(buses),
             load_mean=max(bus.load for bus in buses),
             torque=self._torque_times(),
-            refused={**report.refused, **self.mail.refused},
             messages=self._messages,
         )
 

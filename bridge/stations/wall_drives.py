@@ -9,6 +9,7 @@ from echelon.bridge.frame_message import TimedFrame
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.reports import BusReport, DrivesReport
 from echelon.bridge.roles.drive_bank import DriveBank
+from echelon.bridge.stations.guarding import check_sender, intrusions
 from echelon.bridge.stations.paced_bus import PacedBus
 from echelon.bridge.stations.waiting import RunClock, drained, wait_for
 from echelon.bridge.timing.buses import bus_report, make_buses
@@ -42,6 +43,7 @@ class WallDrives:
             for received in drained(paced.bus):
                 now_ns = clock.now()
                 frame = Frame(received.can_id, received.data, received.remote)
+                check_sender(paced.bus, paced.spoken, received)
                 paced.hear(now_ns, frame, clock.of(received.time_ns))
                 self._send(self.bank.receive(now_ns, number, frame))
         now_ns = clock.now()
@@ -68,7 +70,8 @@ class WallDrives:
                 for number, paced in enumerate(self._buses)
             )
         failed = sum(count.failed + count.dropped for count in counts)
-        return replace(self.bank.report(), failed=failed, buses=buses)
+        others = intrusions(self.plan, [paced.bus for paced in self._buses])
+        return replace(self.bank.report(), failed=failed, buses=buses, intrusions=others)
 
     def lost_and_destroyed(self) -> tuple[int, int]:
         """Returns how many frames the paced buses lost, and how many attempts were destroyed."""

@@ -24,7 +24,10 @@ class CentralLaw:
         self._nu = [make_nu(plan.law, block) for block in self._blocks]
         self._weights = [make_weight(plan.law, block) for block in self._blocks]
         robots = len(plan.robots)
-        self._forces = PairForces(*pairs_between([range(i, i + 1) for i in range(robots)]), robots, plan.avoidance)
+        self._forces = None
+        if plan.avoidance.enabled:
+            self._forces = PairForces(*pairs_between([range(i, i + 1) for i in range(robots)]), robots, plan.avoidance)
+        self._coupled = plan.coupled
         self._ahead_s = plan.lead * plan.root.period_ns * 1e-9
         self.reset()
 
@@ -43,8 +46,8 @@ class CentralLaw:
         e_dot = e_dot.ravel()
         feed_forward = np.zeros_like(e)
         feed_forward[-2:] = self.trajectory.at(t + self._ahead_s)[2] if self._ahead_s else z_cd[2]
-        others = -self.plan.coupling @ e_dot
-        if self.plan.avoidance.enabled and (forces := self._forces(positions)) is not None:
+        others = -self.plan.coupling @ e_dot if self._coupled else np.zeros_like(e)
+        if self._forces is not None and (forces := self._forces(positions)) is not None:
             sigma = np.repeat([block.sigma for block in self._blocks], [block.size for block in self._blocks])
             others += cbt.forward(forces).ravel() / sigma
         z_ddot = np.zeros_like(e)

@@ -11,7 +11,8 @@ from echelon.controller.prediction.likeness import reduced
 from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_links, untreated
 from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.messages import Channel
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.runtime.turns import Turn
 
 

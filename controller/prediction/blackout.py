@@ -14,7 +14,8 @@ from echelon.controller.prediction.mean_square import Losses, places_of
 from echelon.controller.prediction.random_branches import mean
 from echelon.controller.prediction.random_steps import Chances
 from echelon.messages import Channel
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,8 @@ from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.messages import Channel
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 
 LONGEST: Final = 4000
 """Longest wait that is looked at [hyperperiods]"""

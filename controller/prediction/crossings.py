@@ -56,7 +56,7 @@ def crossings(eigenvalues: Eigenvalues, low: float, high: float) -> list[Crossin
         Crossing(omega, float(np.angle(value) % (2 * pi)), falls)
         for omega, falls in found
         for value in eigenvalues(np.array([omega]))[0]
-        if abs(np.log(abs(value))) < SAME
+        if value and abs(np.log(abs(value))) < SAME
     ]
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_array, csc_array, csr_array, eye_array
+from scipy.sparse import block_array, csc_array, csr_array, eye_array, kron
 from scipy.sparse.linalg import splu
 
 from echelon.controller.prediction.crossings import SAME, Crossing, crossings, smallest_delay, unstable_roots
@@ -30,15 +30,38 @@ Complex = NDArray[np.complex128]
 
 def parts(loop: Loop) -> "Iterator[LoopPart]":
     """Yields the parts of a loop whose variables act on each other.  Equal parts are yielded once."""
-    size = loop.A.shape[0]
     seen = set()
-    for rows in strong_parts(csr_array(block_array([[loop.A, loop.B], [loop.C, loop.D]]))):
-        x, u = rows[rows < size], rows[rows >= size] - size
-        part = Loop(loop.A[x][:, x], loop.B[x][:, u], loop.C[u][:, x], loop.D[u][:, u])
-        known = tuple(matrix.toarray().tobytes() for matrix in (part.A, part.B, part.C, part.D))
-        if part.B.nnz + part.D.nnz and known not in seen:
-            seen.add(known)
-            yield LoopPart(part, x)
+    for half, into_whole in mirrored(loop) or ((loop, eye_array(loop.A.shape[0], format="csc")),):
+        states = half.A.shape[0]
+        for rows in strong_parts(csr_array(block_array([[half.A, half.B], [half.C, half.D]]))):
+            x, u = rows[rows < states], rows[rows >= states] - states
+            part = Loop(half.A[x][:, x], half.B[x][:, u], half.C[u][:, x], half.D[u][:, u])
+            known = tuple(matrix.toarray().tobytes() for matrix in (part.A, part.B, part.C, part.D))
+            if part.B.nnz + part.D.nnz and known not in seen:
+                seen.add(known)
+                yield LoopPart(part, into_whole[:, x])
+
+
+def mirrored(loop: Loop) -> tuple[tuple[Loop, csc_array], ...]:
+    """Returns the loop of x + y and the loop of x - y, if exchanging x and y changes nothing; otherwise an empty tuple.
+
+    All variables come in pairs, x before y.  Beside each loop stands a matrix, whose column for a variable of the loop says how
+    the variables of the whole loop move with it."""
+    halves: list[list[csr_array]] = [[], []]
+    for matrix in (loop.A, loop.B, loop.C, loop.D):
+        if any(length % 2 for length in matrix.shape):
+            return ()
+        own, other = matrix[::2, ::2], matrix[::2, 1::2]
+        if (own - matrix[1::2, 1::2]).data.any() or (other - matrix[1::2, ::2]).data.any():
+            return ()
+        for half, combined in zip(halves, (own + other, own - other), strict=True):
+            combined.eliminate_zeros()
+            half.append(csr_array(combined))
+    pairs = eye_array(loop.A.shape[0] // 2)
+    return tuple(
+        (Loop(*half), csc_array(kron(pairs, np.array([[1.0], [sign]]))))
+        for half, sign in zip(halves, (1.0, -1.0), strict=True)
+    )
 
 
 class LoopPart:
@@ -47,8 +70,9 @@ class LoopPart:
     The messages that receivers get act through few combinations, (B; D) = F V with a V of few rows.  So R has the eigenvalues
     of the smaller matrix V (C (z - A)⁻¹, 1) F; the others are zero."""
 
-    def __init__(self, loop: Loop, index: NDArray[np.intp]) -> None:
-        self._index = index
+    def __init__(self, loop: Loop, into_whole: csc_array) -> None:
+        """The columns of `into_whole` say how the variables of the whole loop move with those of the part."""
+        self._into_whole = into_whole
         size = loop.A.shape[0]
         left, strengths, V = np.linalg.svd(np.vstack([loop.B.toarray(), loop.D.toarray()]), full_matrices=False)
         rank = int((strengths > RANK * strengths.max()).sum())
@@ -64,13 +88,13 @@ class LoopPart:
         some = np.array_split(omega, max(1, len(omega) // TOGETHER))
         return np.concatenate([np.linalg.eigvals(self._small(np.exp(1j * each))[0]) for each in some])
 
-    def motions(self, crossing: Crossing) -> tuple[NDArray[np.intp], Complex]:
-        """Returns the motions of x at a crossing: the numbers of its components in the whole run, and their values, a column
-        for each eigenvector."""
+    def motions(self, crossing: Crossing) -> Complex:
+        """Returns the motions of the whole run's x at a crossing, a column for each eigenvector."""
         matrices, states = self._small(np.exp(1j * np.array([crossing.omega])))
         values, vectors = np.linalg.eig(matrices[0])
         away = np.abs(values - np.exp(1j * crossing.angle))
-        return self._index, np.asarray(states[0] @ vectors[:, away <= max(SAME, away.min())], dtype=np.complex128)
+        found = states[0] @ vectors[:, away <= max(SAME, away.min())]
+        return np.asarray(self._into_whole @ found, dtype=np.complex128)
 
     def _small(self, z: Complex) -> tuple[Complex, Complex]:
         """Returns V (C (z - A)⁻¹, 1) F and (z - A)⁻¹ F for several z."""
@@ -121,7 +145,7 @@ class Cut:
         """The frequency ω at which a root first reaches the edge of stability; None if none does."""
         return min(((each.angle / each.omega, each.omega) for each in self.found or ()), default=(inf, None))[1]
 
-    def motions(self, q: int) -> Array | None:
+    def motions(self, q: int) -> Complex | None:
         """Returns the positions of the robots, (motions, N, 2), complex, in the motions that reached the edge of stability last
         before there were q hyperperiods more; None if none did."""
         assert self.found is not None
@@ -130,8 +154,5 @@ class Cut:
         if not before:
             return None
         part, crossing = self._crossings[before[-1]]
-        index, values = part.motions(crossing)
-        whole = np.zeros((values.shape[1], 4 * len(self._run.plan.robots)), dtype=complex)
-        here = index < whole.shape[1]
-        whole[:, index[here]] = values[here].T
-        return whole.reshape(len(whole), -1, 4)[:, :, :2]
+        states = part.motions(crossing)[: 4 * len(self._run.plan.robots)].T
+        return states.reshape(len(states), -1, 4)[:, :, :2]

@@ -292,7 +292,7 @@ class _Search:
         cut = self._cuts.get(r * self._tick_ns)
         if cut is None or cut.found is None or (motions := cut.motions(q)) is None:
             return ()
-        z = np.abs(Transformation(self._plan).forward(motions))
+        z = np.abs(Transformation(self._plan).matrix @ motions)
         moves: dict[tuple[str, ...], float] = {}
         for block, names in zip(self._plan.blocks, self._names, strict=True):
             rows = slice(block.offset // 2, (block.offset + block.size) // 2)

@@ -20,7 +20,14 @@ import numpy as np
 
 from echelon.controller.prediction.gains import linear_gains
 from echelon.controller.prediction.linear_run import Edges, edge_of
-from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, ShapePlan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import (
+    Array,
+    BlockPlan,
+    NodePlan,
+    Plan,
+    ShapePlan,
+)
 
 Numbers = tuple[float, ...]
 

@@ -30,8 +30,10 @@ from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, 
 from echelon.controller.prediction.schedule import schedule
 from echelon.controller.prediction.unit_vectors import Columns, Rows
 from echelon.messages import Channel
+from echelon.plan.delay_tables import LOST
 from echelon.plan.layout import with_message_sizes
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 from echelon.plan.punctuality import with_punctuality
 
 CHANNELS: Final = (Channel.STATE, Channel.GROUP_STATE, Channel.REFERENCE, Channel.COMMAND, Channel.TORQUE)
@@ -87,7 +89,16 @@ def later(plan: Plan, late: Channel | Edges, extra_ns: int) -> Plan:
     def longer(link: LinkPlan) -> LinkPlan:
         if edge_of(link) not in edges:
             return link
-        return replace(link, delay_min_ns=link.delay_min_ns + extra_ns, delay_max_ns=link.delay_max_ns + extra_ns)
+        delays = link.delays
+        if delays is not None:
+            moved = tuple(each if each == LOST else each + extra_ns for each in delays.delays_ns)
+            delays = replace(delays, delays_ns=moved)
+        return replace(
+            link,
+            delay_min_ns=link.delay_min_ns + extra_ns,
+            delay_max_ns=link.delay_max_ns + extra_ns,
+            delays=delays,
+        )
 
     return replace(plan, links=tuple(with_punctuality(list(map(longer, plan.links)), plan.nodes)))
 

@@ -12,7 +12,8 @@ from typing import Literal
 from echelon.controller.prediction.likeness import likeness
 from echelon.controller.prediction.linear_run import CHANNELS, Edges, edge_of, edges_of, ruled_links
 from echelon.messages import Channel
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 
 Kind = Literal["class", "channel", "layer", "all", "group", "robot"]
 LAYERS = ("intra", "middle", "inter")

@@ -22,7 +22,8 @@ from echelon.controller.prediction.random_steps import Chances
 from echelon.controller.prediction.second_moment import SecondMoment
 from echelon.messages import Channel
 from echelon.plan.delay_tables import Bursts
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 
 TRIED: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
 """Losses that are tried one after the other; between the last stable one and the first that is not, a finer search follows"""

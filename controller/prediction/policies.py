@@ -25,7 +25,8 @@ from echelon.controller.prediction.linear_roles import MOTION, moved
 from echelon.controller.prediction.random_steps import Indices
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
-from echelon.plan.plan import Array, LinkPlan, NodePlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, NodePlan, Plan
 
 Block = tuple[Indices, Indices, Array]
 """Rows, columns, and the numbers of a matrix there"""

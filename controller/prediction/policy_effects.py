@@ -15,14 +15,16 @@ from scipy.sparse import csr_array
 
 from echelon.controller.late_states import EXTRAPOLATE, PREDICT
 from echelon.controller.prediction.gains import PredictionError
-from echelon.controller.prediction.linear_run import later, ruled_links
+from echelon.controller.prediction.likeness import reduced
+from echelon.controller.prediction.linear_run import edges_of, later, ruled_links
 from echelon.controller.prediction.mean_square import LossBoundary, mean_square
 from echelon.controller.prediction.random_run import RandomRun
 from echelon.controller.prediction.random_steps import Linear
 from echelon.controller.prediction.spectrum import DENSE, spectral_radius
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 from echelon.plan.punctuality import with_punctuality
 
 POLICIES: Final = {
@@ -34,13 +36,17 @@ POLICIES: Final = {
 """The policies that are compared on each channel; `hold_then_stop` is as `zero` on commands, and not linear elsewhere"""
 LARGEST: Final = 5500
 """Number of registers with which delays are still tried"""
-STEPS: Final = 4000
+STEPS: Final = 2000
 """Hyperperiods over which random states are followed"""
+MANY: Final = 100
+"""Number of registers from which that is tried first: it is faster than all eigenvalues"""
 CLEAR: Final = 1e-3
 """How far from 1 a growth must be that is found so"""
+MOST: Final = 250
+"""Most numbers that may act on each other where losses are computed"""
 LONGEST: Final = 400
 """Longest delay that is tried [periods]"""
-GROWTH: Final = 1.3
+GROWTH: Final = 1.6
 """Ratio of a delay that is tried to the one before, at least"""
 
 
@@ -56,6 +62,8 @@ class PolicyEffect:
     """Why it is not more: one period more is unstable, or longer ones are not tried"""
     loss: LossBoundary | None
     """The loss that it bears in the mean square, with no delay more; None if that is not computed"""
+    why: str = ""
+    """Why it is not computed; empty if it is"""
 
 
 def policy_effects(plan: Plan, channel: Channel, longest: int = LONGEST) -> tuple[PolicyEffect, ...]:
@@ -63,7 +71,12 @@ def policy_effects(plan: Plan, channel: Channel, longest: int = LONGEST) -> tupl
     are tried.
 
     Raises PredictionError if the law is not linear, or if periods differ."""
-    return tuple(_effect(plan, channel, policy, longest) for policy in POLICIES[channel])
+    return tuple(policy_effect(plan, channel, policy, longest) for policy in POLICIES[channel])
+
+
+def uses_policy(link: LinkPlan, policy: str) -> bool:
+    """Returns whether a link has a policy of `POLICIES`; `hold_then_stop` of commands counts as `zero`."""
+    return link.policy == policy or (policy == "zero" and link.policy == "hold_then_stop")
 
 
 def with_policy(plan: Plan, channel: Channel, policy: str, extra_ns: int = 0) -> Plan:
@@ -102,35 +115,50 @@ def largest_stable(is_stable: Callable[[int], bool], most: int) -> tuple[int | N
     return low, True
 
 
-def _effect(plan: Plan, channel: Channel, policy: str, longest: int) -> PolicyEffect:
+def policy_effect(plan: Plan, channel: Channel, policy: str, longest: int = LONGEST) -> PolicyEffect:
+    """Returns what a channel bears with one policy, all its links having it.  Delays up to `longest` periods are tried.
+
+    Raises PredictionError if the law is not linear, or if periods differ."""
     T_ns = plan.root.period_ns
+    alike = reduced(without_chance(plan), edges_of(plan, channel))[
+        0
+    ]  # has the same eigenvalues with any constant delays
 
     def is_stable(periods: int) -> bool:
-        late = with_policy(plan, channel, policy, periods * T_ns)
-        lossless = replace(late, links=tuple(replace(link, loss=0.0, bursts=None) for link in late.links))
-        return radius_without_loss(lossless) < 1
+        return radius_without_loss(with_policy(alike, channel, policy, periods * T_ns), MANY) < 1
 
-    registers = len(RandomRun(with_policy(plan, channel, policy, T_ns), ()).parts()[0].registers)
-    registers -= len(RandomRun(with_policy(plan, channel, policy), ()).parts()[0].registers)
+    registers = len(RandomRun(with_policy(alike, channel, policy, T_ns), ()).parts()[0].registers)
+    registers -= len(RandomRun(with_policy(alike, channel, policy), ()).parts()[0].registers)
     periods, unstable = largest_stable(is_stable, min(longest, LARGEST // max(1, registers) - 2))
+    loss, why = None, ""
     try:
-        loss = mean_square(changed := with_policy(plan, channel, policy), ruled_links(changed, channel))
-    except PredictionError:
-        loss = None
-    return PolicyEffect(
-        channel, policy, None if periods is None else periods * T_ns * 1e-9, "unstable" if unstable else "limit", loss
-    )
+        changed = with_policy(plan, channel, policy)
+        loss = mean_square(changed, ruled_links(changed, channel), largest=MOST)
+    except PredictionError as error:
+        why = str(error)
+    ends: Literal["unstable", "limit"] = "unstable" if unstable else "limit"
+    return PolicyEffect(channel, policy, None if periods is None else periods * T_ns * 1e-9, ends, loss, why)
 
 
-def radius_without_loss(plan: Plan) -> float:
+def without_chance(plan: Plan) -> Plan:
+    """Returns a plan whose links lose nothing."""
+    return replace(plan, links=tuple(replace(link, loss=0.0, bursts=None) for link in plan.links))
+
+
+def radius_without_loss(plan: Plan, many: int = DENSE) -> float:
     """Returns the spectral radius of the run of a plan without loss, with time-driven nodes and any policies.
 
-    Where it is clearly not 1 and the run has many registers, it is the growth of random states over many hyperperiods."""
-    found = []
+    Where it is clearly not 1 and the run has more than `many` registers, it is the growth of random states over many
+    hyperperiods."""
+    found, seen = [], list[Array]()
     for part in RandomRun(plan, ()).parts():
         (step,) = part.steps
         assert isinstance(step, Linear)
-        growth = _growth(step.F) if step.F.shape[0] > DENSE else 1.0
+        image = step.F @ np.random.default_rng(0).normal(size=step.F.shape[1])
+        if any(one.shape == image.shape and np.allclose(one, image, rtol=1e-9, atol=0) for one in seen):
+            continue  # x and y, and groups that are alike
+        seen.append(image)
+        growth = _growth(step.F) if step.F.shape[0] > many else 1.0
         found.append(growth if abs(growth - 1) > CLEAR else spectral_radius(step.F))
     return max(found)
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from echelon.controller.prediction.gains import PredictionError
 from echelon.messages import Channel
-from echelon.plan.delay_tables import BITS, DelayTrace, looked_up
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.delay_tables import BITS, LOST, Z_BITS, DelayTrace, looked_up, looked_up_z
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 
 LONGEST: Final = 12
 """Longest delay that is treated [periods]"""
@@ -76,3 +77,19 @@ def _missing(link: LinkPlan, periods: int) -> float:
         draws = (2 * np.arange(DRAWS, dtype=np.int64) + 1) << (BITS - 17)
         late = np.mean(looked_up(np.array(link.delays.delays_ns), draws) > after_ns)
     return float(link.loss + (1 - link.loss) * late)
+
+
+def mean_delay_ns(link: LinkPlan) -> int:
+    """Returns the mean delay of the messages of a link that are not lost [ns]."""
+    if link.delays is None:
+        return (link.delay_min_ns + link.delay_max_ns) // 2
+    if isinstance(link.delays, DelayTrace):
+        there = [each for each in link.delays.delays_ns if each != LOST]
+        return round(float(np.mean(there))) if there else 0
+    draws = (2 * np.arange(DRAWS, dtype=np.int64) + 1) << (BITS - 17)
+    if link.delays.correlation:
+        from scipy.special import ndtri  # takes long to import
+
+        z = np.rint(ndtri((np.arange(DRAWS) + 0.5) / DRAWS) * (1 << Z_BITS)).astype(np.int64)
+        return round(float(np.mean(looked_up_z(np.array(link.delays.delays_ns), z))))
+    return round(float(np.mean(looked_up(np.array(link.delays.delays_ns), draws))))

@@ -106,7 +106,7 @@ class Linear:
 
     def needs(self, live: Bits) -> Bits:
         found = np.zeros(self.F.shape[1], dtype=bool)
-        found[self.F[live].indices] = True
+        found[self.F.indices[np.repeat(live, np.diff(self.F.indptr))]] = True
         return found
 
     def edges(self) -> Iterable[tuple[Indices, Indices]]:

@@ -15,7 +15,8 @@ from echelon.controller.prediction.policies import Block, Policies
 from echelon.controller.prediction.random_delays import oldest, varies
 from echelon.controller.prediction.random_steps import Choice, Indices, Jump, Linear, Step
 from echelon.messages import Channel
-from echelon.plan.plan import Array, LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Array, Plan
 from echelon.role import Input
 from echelon.runtime.turns import Turn
 

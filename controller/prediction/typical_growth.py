@@ -15,7 +15,8 @@ import numpy as np
 from echelon.controller.prediction.mean_square import Losses, places_of
 from echelon.controller.prediction.random_branches import sample
 from echelon.messages import Channel
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 
 RUNS: Final = 64
 """Runs that are followed"""

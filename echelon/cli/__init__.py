@@ -61,6 +61,9 @@ def _main(arguments: Sequence[str] | None, output: Output | None) -> int:
     except BrokenPipeError:
         return NOBODY_READS
     except KeyboardInterrupt:
+        # Where the interrupt came out of an `exec`, as of a dataclass that is made, Python would end the process by SIGINT
+        # whatever is returned here.  The next `exec` makes it forget that.
+        exec("")
         print("echelon: interrupted", file=sys.stderr)
         return 3
     except Exception as error:

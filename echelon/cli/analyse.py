@@ -13,7 +13,7 @@ from echelon.errors import UsageError
 
 if TYPE_CHECKING:
     from echelon.plan.plan import Plan
-    from echelon.scenario.tables import Law
+    from echelon.scenario.law_tables import Law
     from echelon.sim.results.analysis import AnalysisResult
 
 LONG_S: Final = 2.0
@@ -25,11 +25,18 @@ class AnalyseOptions(ScenarioOptions):
     """Options of `echelon analyse`."""
 
     members: bool = field(default=False, metadata=option("also what the links of each robot and each group tolerate"))
+    policies: bool = field(
+        default=False, metadata=option("also what hold, zero, extrapolate and predict buy on each channel")
+    )
     figures: Path | None = field(
         default=None, metadata=option("write each figure as a file into this folder, beside the text", "DIR")
     )
     format: tuple[Literal["svg", "pdf", "png"], ...] = field(
         default=(), metadata=option("format of the files of --figures; may be repeated (default: svg)")
+    )
+    runs: int = field(
+        default=64,
+        metadata=option("runs of the batch engine for each number that can only be estimated; 0: leave them out", "N"),
     )
     json: bool = field(default=False, metadata=JSON)
 
@@ -47,10 +54,22 @@ def analyse(options: AnalyseOptions) -> int:
 
     if options.format and options.figures is None:
         raise UsageError(f"--format {options.format[0]}: needs --figures DIR, which writes the figures as files")
+    if not 0 <= options.runs <= 100_000:
+        raise UsageError(f"--runs {options.runs}: must be from 0 to 100000")
     scenario, plan = read_scenario(options.scenario, options.overrides)
+    asked = asked_of(plan)
     law, progress = scenario.law, _Progress()
     try:
-        found = analysis_of(plan, law.time_scales, law.epsilon, members=options.members, say=progress.say)
+        found = analysis_of(
+            plan,
+            law.time_scales,
+            law.epsilon,
+            asked,
+            members=options.members,
+            policies=options.policies,
+            runs=options.runs,
+            say=progress.say,
+        )
     except PredictionError as error:
         raise UsageError(f"{options.scenario}: cannot be analysed; run it instead: {error}") from None
     finally:
@@ -59,7 +78,7 @@ def analyse(options: AnalyseOptions) -> int:
     if options.json:
         print(json_text(found))
     else:
-        print("\n".join(lines_of(found, torque_loop_warnings(plan, asked_of(plan)))))
+        print("\n".join(lines_of(found, torque_loop_warnings(plan, asked))))
         print(*written, sep="\n", end="\n" if written else "")
     return 0 if found.settles and not found.torque_loop_diverges else 1
 
@@ -69,11 +88,16 @@ def _save_figures(
 ) -> list[Path]:
     """Writes the figures; returns their files.  Raises UsageError if that fails."""
     from echelon.sim.forecast.analysing import scaled_delays
+    from echelon.sim.forecast.own_links import calm
     from echelon.sim.report.analysis_figures import analysis_figures
 
     words = ["echelon", "analyse", options.scenario, *(word for each in options.overrides for word in ("--set", each))]
     try:
-        scaled = scaled_delays(plan, law.time_scales, law.epsilon, progress.say) if found.settles else ()
+        scaled = (
+            scaled_delays(calm(plan)[0], law.time_scales, law.epsilon, progress.say)
+            if any(one.delay.seconds for one in found.table)
+            else ()
+        )
     finally:
         progress.end()
     assert options.figures is not None
@@ -115,16 +139,17 @@ ANALYSE: Final = Command(
     options=AnalyseOptions,
     work=analyse,
     about="""\
-Computes, without a run, whether the formation settles with the periods of the scenario and the
-constant delays of its links, how each block's error decays, and what links tolerate: a table of
-layers and channels with the largest delay and what limits it.  Further how large ε and couplings
-may be, exactly and by Lyapunov bounds, and whether the torque loops inside the robots are stable.
-It assumes that robots follow the desired accelerations exactly.  It refuses links that lose
-messages or whose delays vary, and laws that are not linear: run such scenarios instead.""",
+Computes whether the formation settles with the periods and links of the scenario, how each block's
+error decays, what that costs, and what links tolerate: a table of layers and channels with the
+largest delay and loss and what limits them.  Further how large ε and couplings may be, exactly and
+by Lyapunov bounds, and whether the torque loops inside the robots are stable.  It assumes that
+robots follow the desired accelerations exactly.  What cannot be computed exactly, as for delays
+that vary on several links, is estimated by runs without limits and called so.  Laws that are not
+linear are refused: run such scenarios instead.""",
     examples={
         "echelon analyse paper": "states may be up to 6.8 ms late",
         "echelon analyse lab --set 'links=[{channel=\"state\",delay=0.3}]'": "with a delay",
-        "echelon analyse lab --members": "also what the links of each robot and each group tolerate",
+        "echelon analyse lab --policies --members": "also what other policies buy, and what each robot's links tolerate",
         "echelon analyse lab --figures figures --format pdf": "also figures, as PDF",
         "echelon analyse lab --json": "for scripts (`echelon schema analysis` describes it)",
     },

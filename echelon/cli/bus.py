@@ -67,19 +67,41 @@ class RefereeOptions(ListenOptions):
 
     tolerance: float | None = field(
         default=None,
-        metadata=option("live: how late a cyclic frame may be (default: half its period)", "S"),
+        metadata=option("how late a cyclic frame may be, live and with --log (default: half its period)", "S"),
+    )
+    log: Path | None = field(
+        default=None,
+        metadata=option(
+            "judge this log: of candump (also as it shows frames), ASC, BLF, TRC, or python-can's CSV; also gzipped",
+            "FILE",
+        ),
+    )
+    map: tuple[str, ...] = field(
+        default=(),
+        metadata=option(
+            "with --log: frames of this interface are those of this bus (vcan0=can0); may be repeated (default: equal "
+            "names; a number in the log is that of a bus of the scenario, from 1)",
+            "INTERFACE=BUS",
+        ),
     )
 
 
 def referee(options: RefereeOptions) -> int:
     """Prints what breaks the contract on a scenario's buses, or in a run's can.log.  Returns exit code 1 if something does."""
-    from echelon.cli.judging import finding_lines, judge_live, judge_run, verdict
+    from echelon.cli.judging import finding_lines, judge_foreign, judge_live, judge_run, verdict
     from echelon.sim.results.rendering import json_text
     from echelon.sim.run_state import goes_on
 
     plan, folder = _plan_of(options)
-    logged = folder is not None and options.can is None
-    if folder is not None and logged:
+    if options.map and options.log is None:
+        raise UsageError(f"--map {options.map[0]}: needs --log FILE")
+    for name, value in (("--can", options.can), ("--seconds", options.seconds)):
+        if options.log is not None and value is not None:
+            raise UsageError(f"{name} {value}: is for live buses; --log {options.log} is judged as a whole")
+    logged = options.log is not None or (folder is not None and options.can is None)
+    if options.log is not None:
+        report = judge_foreign(plan, options.log, options.map, options.tolerance)
+    elif folder is not None and logged:
         if goes_on(folder):
             print(f"echelon: {folder}: the run goes on; this is about what its can.log holds so far", file=sys.stderr)
         report = judge_run(plan, folder)
@@ -127,9 +149,10 @@ class DrivesOptions(ScenarioOptions):
 
 def drives(options: DrivesOptions) -> int:
     """Runs the virtual drives of a scenario alone, in real time."""
+    from echelon.bridge.can.claim import DRIVES
     from echelon.cli.drive_bench import serve
     from echelon.cli.scenario_file import read_scenario
-    from echelon.sim.bus_urls import bus_urls, check_wall_clock
+    from echelon.sim.bus_urls import bus_urls, check_wall_clock, claimed
 
     _, plan = read_scenario(options.scenario, [*options.overrides, "can.path=closed", "can.virtual_drives=true"])
     urls = bus_urls(plan, options.can, False)
@@ -138,7 +161,8 @@ def drives(options: DrivesOptions) -> int:
             "drives need a bus that other processes can use: give --can socketcan:vcan0, udp_multicast: or auto"
         )
     check_wall_clock(plan, urls)
-    serve(plan, urls, options.seconds, options.json)
+    with claimed(urls, DRIVES):
+        serve(plan, urls, options.seconds, options.json)
     return 0
 
 
@@ -182,10 +206,12 @@ folder of a run it reads can.log: it shows how the run ended, or follows a run t
         about="""\
 Judges the frames on the buses, and nothing else: periods, counters, checksums, limits, state
 machines, silence.  Prints what breaks the contract between the scenario's drives and their
-host.""",
+host.  Lines of a log that cannot be read, and frames of other interfaces, are counted and are
+no findings; if nothing else is left, the exit code is 2.""",
         examples={
             "echelon referee runs/demo": "the can.log of a run",
             "echelon referee lab --can socketcan:vcan0 --seconds 10.0": "live",
+            "echelon referee lab --log candump.log --map vcan0=can0": "what another program logged",
         },
         codes={0: "no findings", 1: "something breaks the contract"},
     ),

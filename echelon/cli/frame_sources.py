@@ -16,9 +16,9 @@ from typing import Final, NamedTuple
 
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.can.bus_url import interface_is_up, resolve_url
-from echelon.bridge.can.canlog import read_lines
+from echelon.bridge.can.log_files import read_lines
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.referee.referee import of_run, read_run_log
+from echelon.bridge.referee.log import PlanLog, read_run_log
 from echelon.bridge.stations.closed import LOG
 from echelon.errors import UsageError
 from echelon.plan.plan import Plan
@@ -88,15 +88,12 @@ def _urls(plan: Plan, wanted: str | None) -> list[str]:
 def listen(buses: Sequence[Bus], seconds: float | None) -> Iterator[Heard]:
     """Yields the frames that come on buses, for some seconds or (None) for ever.
 
-    An error of a bus is said once on standard error; listening goes on."""
+    An error of a bus is said once on standard error; listening goes on, also on an interface that is removed and comes back."""
     start_ns, start_s = time.time_ns(), time.monotonic()
-    numbers = {bus.fileno(): number for number, bus in enumerate(buses)}
     errors = [0] * len(buses)
     while seconds is None or time.monotonic() - start_s < seconds:
-        ready, _, _ = select.select(list(numbers), [], [], TICK_S)
-        for descriptor in ready:
-            number = numbers[descriptor]
-            bus = buses[number]
+        select.select(list(buses), [], [], TICK_S)
+        for number, bus in enumerate(buses):  # all of them: nothing wakes a socket whose interface is gone
             for _ in range(_AT_ONCE):
                 received = bus.recv(0.0)
                 if received is None:
@@ -151,7 +148,7 @@ def follow(folder: Path, plan: Plan, seconds: float | None) -> Iterator[Heard]:
             while not over and (seconds is None or time.monotonic() - start_s < seconds):
                 over = not goes_on(folder)  # asked before the log is read, so that nothing written in between is missed
                 *lines, rest = (rest + log.read(_AT_ONCE_BYTES)).split("\n")
-                for time_ns, bus, frame in of_run(read_lines(lines), plan):
+                for time_ns, bus, frame in PlanLog(read_lines(lines), plan).frames():
                     yield Heard(time_ns, bus, frame)
                 if lines:
                     over = False

@@ -1,16 +1,19 @@
-"""What `echelon referee` does: it judges the frames on buses, or in the can.log of a run's folder."""
+"""What `echelon referee` does: it judges the frames on buses, in a run's can.log, or in the log of another program."""
 
-import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from echelon.bridge.referee.referee import Referee, judge_log
-from echelon.bridge.reports import RefereeReport
+from echelon.bridge.can.candump import BACKWARDS
+from echelon.bridge.referee.log import judge_log, names_in
+from echelon.bridge.referee.referee import Referee
+from echelon.bridge.referee_reports import RefereeReport
 from echelon.bridge.stations.closed import LOG
 from echelon.cli.frame_sources import listen, open_buses
 from echelon.errors import UsageError
+from echelon.files import read_json
 from echelon.plan.plan import Plan
 from echelon.sim.run_state import goes_on, read_state
 from echelon.sim.view.wheel_table import finding_text
@@ -33,27 +36,75 @@ def terms_of(folder: Path, plan: Plan) -> Terms:
     On a wall clock processes may be late, so frames may be, too."""
     state = read_state(folder)
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        run, until_s = summary["run"], summary["simulated"]
+        summary = read_json((folder / "summary.json").read_bytes())
+        run, until_s = dict(summary["run"]), summary["simulated"]
     except (OSError, ValueError, KeyError, TypeError):
         run, until_s = {}, None
     clock = run.get("clock") or (state.clock if state else "")
     whole = not (run.get("failure") or run.get("stopped") or goes_on(folder))
-    until_ns = round(until_s * 1e9) if until_s is not None and run.get("stopped") else None
+    known = isinstance(until_s, int | float) and abs(until_s) < 1e9
+    until_ns = round(until_s * 1e9) if known and run.get("stopped") else None
     return Terms(plan.can.watchdog_ns // 2 if clock == "wall" else None, whole, until_ns)
 
 
 def judge_run(plan: Plan, folder: Path) -> RefereeReport:
     """Returns what the referee finds in a run's can.log; of a run that goes on, in what it holds so far.
 
-    Raises UsageError if the log cannot be read."""
+    Raises UsageError if the log cannot be read, or holds things but no frame of the plan."""
     terms = terms_of(folder, plan)
     try:
-        return judge_log(
+        report = judge_log(
             folder / LOG, plan, tolerance_ns=terms.tolerance_ns, whole=terms.whole, until_ns=terms.until_ns
         )
     except OSError as error:
         raise UsageError(f"{folder / LOG}: {error.strerror}") from None
+    if report.left_out and not report.frames:
+        raise UsageError(f"{folder / LOG}: {_nothing(plan, report)}; it is not as the run wrote it")
+    return report
+
+
+def judge_foreign(plan: Plan, path: Path, pairs: Sequence[str], tolerance_s: float | None) -> RefereeReport:
+    """Returns what the referee finds in a log that another program wrote; `pairs` are those of `--map`.
+
+    Raises UsageError if the log cannot be read, if it holds no frame of the plan, and for a wrong value of an option."""
+    _check_tolerance(tolerance_s)
+    buses = {bus.name: number for number, bus in enumerate(plan.can.buses)}
+    names = {} if pairs else names_in(plan)
+    for pair in pairs:
+        interface, _, bus = pair.rpartition("=")
+        if not interface or bus not in buses:
+            raise UsageError(f"--map {pair}: must be INTERFACE=BUS, with BUS one of {', '.join(buses)}")
+        names[interface] = buses[bus]
+    try:
+        report = judge_log(path, plan, names=names, tolerance_ns=_nanoseconds(tolerance_s), whole=False)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror or error}") from None
+    if not report.frames:
+        hint = "" if pairs else "; --map INTERFACE=BUS says which bus an interface is"
+        raise UsageError(f"{path}: {_nothing(plan, report)}{hint if report.left_out else ''}")
+    if BACKWARDS in report.left_out:
+        raise UsageError(f"{path}: cannot be judged: {_left_out(report, '')}")
+    return replace(report, source=str(path))
+
+
+def _nothing(plan: Plan, report: RefereeReport) -> str:
+    """Returns a text about a log without frames of the plan."""
+    names = ", ".join(bus.name for bus in plan.can.buses)
+    return f"holds no frame of a bus of the scenario ({names}){_left_out(report, ', but ')}"
+
+
+def _left_out(report: RefereeReport, before: str) -> str:
+    counts = (f"{count} {reason}" for reason, count in report.left_out.items())
+    return before + ", ".join(counts) if report.left_out else ""
+
+
+def _check_tolerance(tolerance_s: float | None) -> None:
+    if tolerance_s is not None and not 0 <= tolerance_s < 1e9:
+        raise UsageError(f"--tolerance {tolerance_s:g}: must be 0 s or more")
+
+
+def _nanoseconds(seconds: float | None) -> int | None:
+    return None if seconds is None else round(seconds * 1e9)
 
 
 def judge_live(
@@ -63,9 +114,8 @@ def judge_live(
 
     Unless `quiet`, the findings that the report keeps are printed as they are made.  Raises UsageError for a tolerance that is
     negative, and if a bus cannot be opened."""
-    if tolerance_s is not None and not 0 <= tolerance_s < 1e9:
-        raise UsageError(f"--tolerance {tolerance_s:g}: must be 0 s or more")
-    judge = Referee(plan, tolerance_ns=None if tolerance_s is None else round(tolerance_s * 1e9), late=True)
+    _check_tolerance(tolerance_s)
+    judge = Referee(plan, tolerance_ns=_nanoseconds(tolerance_s), late=True)
     buses = open_buses(plan, wanted)
     time_ns = 0
     try:
@@ -100,4 +150,5 @@ def verdict(report: RefereeReport) -> str:
     kinds = ", ".join(f"{kind} {count}" for kind, count in report.kinds.items())
     foreign = f", {report.unknown} frames of others" if report.unknown else ""
     seen = f"{report.frames} frames of {len(report.identifiers)} identifiers{foreign}{report.up_to}"
-    return f"{seen}: {sum(report.kinds.values())} findings: {kinds}" if kinds else f"{seen}: no findings"
+    found = f"{sum(report.kinds.values())} findings: {kinds}" if kinds else "no findings"
+    return f"{seen}: {found}{_left_out(report, '; left out: ')}"

@@ -1,6 +1,7 @@
 """The command `echelon observe`."""
 
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +29,7 @@ def observe(options: ObserveOptions) -> int:
     from echelon.cli.scenario_file import read_scenario
     from echelon.errors import UsageError
     from echelon.messages import STATE_FIELDS, TORQUE_FIELDS, Channel
+    from echelon.runtime.admission import Refusals
     from echelon.sim.observing import Ticket
     from echelon.sim.observing import observe as messages_of
 
@@ -40,7 +42,8 @@ def observe(options: ObserveOptions) -> int:
     if options.channel is not None and options.channel not in allowed:
         raise UsageError(f"--channel {options.channel}: must be {', '.join(allowed)}")
     fields = {Channel.STATE: STATE_FIELDS, Channel.TORQUE: TORQUE_FIELDS}
-    for message in messages_of(ticket, options.under):
+    refusals = Refusals()
+    for message in messages_of(ticket, plan, options.under, refusals):
         channel = message.channel.name.lower()
         if options.channel not in (None, channel):
             continue
@@ -54,6 +57,8 @@ def observe(options: ObserveOptions) -> int:
         else:
             shown = " ".join(f"{value:.4g}" for value in values) or "(null)"
             print(f"{message.time_ns / 1e9:>10.4f} s  {names[message.source]:<12} {channel:<12} {shown}", flush=True)
+    if refusals.total:
+        print(f"{refusals.total} messages refused: {refusals.by_source()}", file=sys.stderr)
     return 0
 
 

@@ -7,6 +7,7 @@ from typing import Final, Literal
 
 from echelon.cli.options import Command, option
 from echelon.cli.shared import ScenarioOptions, seconds
+from echelon.sim.interruption import interruption
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +36,10 @@ class RunOptions(ScenarioOptions):
             "URL",
         ),
     )
+    real_bus: bool = field(
+        default=False,
+        metadata=option("let a run in virtual time, or one that mirrors torques, send frames onto a bus of hardware"),
+    )
     json: bool = field(default=False, metadata=option("print the summary as JSON"))
     quiet: bool = field(default=False, metadata=option("show no progress while the run goes on"))
     no_report: bool = field(default=False, metadata=option("do not write report.html"))
@@ -53,16 +58,28 @@ class RunOptions(ScenarioOptions):
 
 def run(options: RunOptions) -> int:
     """Runs a scenario, writes its folder, and prints the summary."""
+    # Signals are noted from the start on, so that one before the run leaves no process and no folder behind.
+    with interruption() as noted:
+        try:
+            return _run(options)
+        except Exception:
+            if noted.asked:  # libraries make other exceptions of an interrupt
+                raise KeyboardInterrupt from None
+            raise
+
+
+def _run(options: RunOptions) -> int:
+    from echelon.cli.scenario_file import read_scenario
+
+    scenario, plan = read_scenario(options.scenario, options.overrides)
     if options.engine == "processes":
         from echelon.sim.processes.children import warm_up
 
-        warm_up()
-    from echelon.cli.scenario_file import read_scenario
+        warm_up(plan)  # before the imports below, which take as long
     from echelon.sim.launch import Launch, launch
     from echelon.sim.results.rendering import json_text
     from echelon.sim.results.summary import summary_text
 
-    scenario, plan = read_scenario(options.scenario, options.overrides)
     try:
         finished = launch(
             scenario,
@@ -77,11 +94,13 @@ def run(options: RunOptions) -> int:
                 stall_timeout_s=options.stall_timeout,
                 keep_going=options.keep_going,
                 replace=options.replace,
+                real_bus=options.real_bus,
                 observe=options.observe,
             ),
         )
     except OSError as error:
-        print(f"echelon: {error.filename}: {error.strerror or error}", file=sys.stderr)
+        for line in (*getattr(error, "__notes__", ()), f"{error.filename}: {error.strerror or error}"):
+            print(f"echelon: {line}", file=sys.stderr)
         return 3
     if options.json:
         print(json_text(finished.summary))

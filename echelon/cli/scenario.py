@@ -97,8 +97,10 @@ def validate(options: ValidateOptions) -> int:
     from echelon.cli.scenario_file import read_scenario
     from echelon.sim.forecast.warnings import warnings
     from echelon.sim.results.verdict import count
+    from echelon.sim.wall_load import wall_load
 
     scenario, plan = read_scenario(options.scenario, options.overrides)
+    load = wall_load(plan, frames=True)
     facts: dict[str, Any] = {
         "scenario": scenario.name,
         "robots": len(plan.robots),
@@ -108,6 +110,7 @@ def validate(options: ValidateOptions) -> int:
         "time_scales": {block.name: block.sigma for block in plan.blocks},
         "can": list(describe_fit(plan)) if plan.can.enabled else ["disabled"],
         "warnings": warnings(plan),
+        "wall_clock": {"load": load.share, "processors": load.processors, "robots_that_fit": load.most},
     }
     code = 2 if options.strict and facts["warnings"] else 0
     if options.json:
@@ -119,6 +122,8 @@ def validate(options: ValidateOptions) -> int:
     print("  σ  " + "  ".join(f"{name} {sigma:g} s" for name, sigma in facts["time_scales"].items()))
     for line in facts["can"]:
         print(f"  CAN  {line}")
+    if load.warning:
+        print(f"  {load.warning}")
     for line in facts["warnings"]:
         print(f"  warning  {line}")
     return code

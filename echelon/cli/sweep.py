@@ -66,7 +66,7 @@ class SweepOptions:
             parse=_count,
         ),
     )
-    engine: Literal["batch", "inprocess", "processes"] | None = field(
+    engine: Literal["batch", "gpu", "inprocess", "processes"] | None = field(
         default=None,
         metadata=option("who makes the runs (default: batch where it can, otherwise inprocess)"),
     )

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from echelon.messages import Channel
-from echelon.plan.plan import LinkPlan, NodePlan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import NodePlan
 
 
 def with_punctuality(links: Sequence[LinkPlan], nodes: Sequence[NodePlan]) -> list[LinkPlan]:

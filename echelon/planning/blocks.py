@@ -8,7 +8,8 @@ import numpy as np
 
 from echelon.errors import Mistakes
 from echelon.plan.plan import Array, BlockPlan, NodePlan, PlanError
-from echelon.scenario.tables import BLOCK_NAMES, Coupling, Law
+from echelon.scenario.law_tables import Coupling, Law
+from echelon.scenario.tables import BLOCK_NAMES
 from echelon.scenario.values import Matrix
 
 

@@ -11,7 +11,8 @@ from echelon.errors import Mistakes
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS, BusRolePlan, CanPlan
 from echelon.plan.delay_tables import TRUE_CLOCK, Bursts, DelayTable, DelayTrace, merged
-from echelon.plan.plan import LinkPlan, NodePlan, PlanError, RobotPlan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import NodePlan, PlanError, RobotPlan
 from echelon.plan.punctuality import with_punctuality
 from echelon.planning.delays import delays_of
 from echelon.scenario.link_tables import Blackout, CutOff, LinkRule

@@ -27,7 +27,9 @@ ROBOT_DEFAULTS: Final[dict[str, Any]] = {
 }
 DEFAULT_PLANT: Final = "paper"
 MAX_ROBOTS: Final = 127
-"""Largest number of robots: a bus has identifiers for no more if each robot has three of its own."""
+"""Largest number of robots on a bus: it has identifiers for no more if each robot has three of its own."""
+MOST_ROBOTS: Final = 1000
+"""Largest number of robots without a bus: some matrices of a plan grow with the square of it."""
 MAX_NS: Final = 2**62
 """Upper bound of durations [ns], 146 years: the sum of two of them still fits the message header."""
 
@@ -43,8 +45,13 @@ def nanoseconds(seconds: float, key: str) -> int:
 def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPlan, ...], tuple[NodePlan, ...], CanPlan]:
     """Returns the robots and the nodes in the order of their indices, and the plan of the buses.  Raises PlanError."""
     count = _count_robots(scenario.formation)
-    if count > MAX_ROBOTS:
-        raise PlanError(f"formation: {count} robots, but a bus has identifiers for {MAX_ROBOTS}")
+    if count > MAX_ROBOTS and scenario.can.enabled:
+        raise PlanError(
+            f"formation: {count} robots, but a bus has identifiers for {MAX_ROBOTS}; with can.enabled = false there may be "
+            f"{MOST_ROBOTS}"
+        )
+    if count > MOST_ROBOTS:
+        raise PlanError(f"formation: {count} robots: must be at most {MOST_ROBOTS}")
     torque_ns = nanoseconds(scenario.periods.torque, "periods.torque")
     can = make_can(scenario.can, torque_ns)
     walk = _Walk(
@@ -57,7 +64,7 @@ def make_members(scenario: Scenario, registry: Registry) -> tuple[tuple[RobotPla
     )
     walk.add_group(scenario.formation, _Place("formation", "", None, 0, 0), scenario.robot, scenario.timing)
     walk.check()
-    return walk.drives.placed(walk.robots), tuple(walk.nodes), can
+    return walk.drives.placed(walk.robots) if can.enabled else tuple(walk.robots), tuple(walk.nodes), can
 
 
 def robot_key(path: str) -> str:

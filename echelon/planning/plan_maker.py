@@ -15,13 +15,13 @@ from echelon.errors import Mistakes
 from echelon.part_groups import Registry
 from echelon.plan.can_plan import BusRolePlan, CanPlan, EventPlan
 from echelon.plan.layout import with_message_sizes
+from echelon.plan.link_plan import LinkPlan
 from echelon.plan.plan import (
     COORDINATOR,
     AvoidancePlan,
     BlockPlan,
     ClaimPlan,
     HealthPlan,
-    LinkPlan,
     NodePlan,
     Plan,
     PlanError,
@@ -31,7 +31,8 @@ from echelon.planning.blocks import fitting, make_blocks, make_coupling
 from echelon.planning.drives import make_events
 from echelon.planning.links import make_links
 from echelon.planning.members import MAX_ROBOTS, make_members, nanoseconds, robot_key
-from echelon.scenario.tables import Law, Scenario
+from echelon.scenario.law_tables import Law
+from echelon.scenario.tables import Scenario
 from echelon.scenario.values import path_matches
 
 

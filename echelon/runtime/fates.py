@@ -44,7 +44,7 @@ from echelon.plan.delay_tables import (
     looked_up,
     looked_up_z,
 )
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 
 BLOCK: Final = 512
 """Messages per block of draws.  A message takes two 64-bit words; each count of the Philox counter gives four words."""

@@ -18,12 +18,15 @@ from heapq import heapify, heappop, heappush
 from typing import Final
 
 from echelon.messages import Channel, Message
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.runtime.ages import AgeCounts
 from echelon.runtime.fates import Copies, Fates
 
 PERCENTILES: Final = (0.5, 0.95, 0.99)
 """The shares of uses whose largest age is told"""
+_Open = tuple[int, int, int]
+"""When a message is first needed [ns], its number, and its earliest possible arrival [ns].  It is needed when it may arrive; on
+a link that keeps the order, when all those before it may, too"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,7 @@ class Link:
         "_age_sum",
         "_aged",
         "_ages",
+        "_awaited",
         "_copies",
         "_delivered",
         "_duplicates",
@@ -72,6 +76,7 @@ class Link:
         "_last",
         "_latest_ns",
         "_lost",
+        "_needed_ns",
         "_open",
         "_period_ns",
         "_sent",
@@ -86,10 +91,14 @@ class Link:
         self._first_ns, self._period_ns = plan.first_ns, plan.period_ns
         self._latest_ns = plan.first_ns
         """The latest arrival so far, of first copies"""
+        self._needed_ns = plan.first_ns
+        """When the message drawn last is needed"""
         self._sent = self._delivered = self._duplicates = self._lost = self._used = self._held = 0
         self.latest = self._last = self._expected = -1
-        self._open: list[tuple[int, int]] = []
-        """Messages that are due, not lost, and not in `_flying` yet, by number: number and earliest possible arrival"""
+        self._open: list[_Open] = []
+        """Messages that are due, not lost, and not needed yet, as a heap"""
+        self._awaited: list[_Open] = []
+        """Messages that were needed already, and have not come, in the order in which they were needed"""
         self._flying: list[tuple[int, int]] = []
         """Messages on their way, as a heap: instant of arrival and number"""
         self._copies: list[int] = []
@@ -124,25 +133,30 @@ class Link:
         `came` has the messages that have come, by number, from number `in_use` + 1 on.  Those that a blackout takes away are
         removed from it."""
         self._open_due(time_ns)
-        if not self._open:
+        opened = self._open
+        needed = self._awaited
+        if not needed and not (opened and opened[0][0] <= until_ns):
             return True
+        while opened and opened[0][0] <= until_ns:
+            needed.append(heappop(opened))
         complete, fifo = True, self.plan.fifo
-        still_open: list[tuple[int, int]] = []
-        for at, (number, earliest_ns) in enumerate(self._open):
-            if fifo and still_open:  # it cannot arrive before those that were sent before it
-                still_open += self._open[at:]
+        awaited: list[_Open] = []
+        self._awaited = awaited
+        for at, one in enumerate(needed):
+            if fifo and awaited:  # it cannot arrive before those that were sent before it
+                awaited += needed[at:]
                 break
-            if earliest_ns > until_ns:
-                still_open.append((number, earliest_ns))
+            needed_ns, number, earliest_ns = one
+            if needed_ns > until_ns:
+                awaited.append(one)
             elif number <= in_use:  # it was overtaken, and changes nothing
                 heappush(self._flying, (earliest_ns, number))
             elif (message := came.get(number)) is None:
                 complete = False
-                still_open.append((number, earliest_ns))
+                awaited.append(one)
             elif self._depart(message) is None:
                 self._lost += 1
                 del came[number]
-        self._open = still_open
         return complete
 
     def _open_due(self, time_ns: int) -> None:
@@ -151,7 +165,9 @@ class Link:
         while self._sent <= last:
             copies = self._known(self._sent)
             if copies:
-                self._open.append((self._sent, self.sent_ns(self._sent) + min(copies)))
+                earliest_ns = self.sent_ns(self._sent) + min(copies)
+                self._needed_ns = max(self._needed_ns, earliest_ns) if self.plan.fifo else earliest_ns
+                heappush(self._open, (self._needed_ns, self._sent, earliest_ns))
             else:
                 self._lost += 1
             self._sent += 1
@@ -179,14 +195,8 @@ class Link:
     def expected(self, time_ns: int) -> int:
         """Returns the number of the newest message that would have arrived by `time_ns` if all were sent when they are due."""
         self._open_due(time_ns)
-        if self._open:
-            still_open = []
-            for number, earliest_ns in self._open:
-                if earliest_ns > time_ns:
-                    still_open.append((number, earliest_ns))
-                elif number > self._expected:
-                    self._expected = number
-            self._open = still_open
+        while self._open and self._open[0][0] <= time_ns:
+            self._expected = max(self._expected, heappop(self._open)[1])
         return self._expected
 
     def receive(self, message: Message, time_ns: int) -> int | None:

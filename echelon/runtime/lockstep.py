@@ -11,7 +11,8 @@ from typing import Final
 
 from echelon.messages import Message
 from echelon.plan.plan import Plan
-from echelon.role import Role, Stage
+from echelon.role import Role
+from echelon.runtime.admission import Fits
 from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
@@ -20,7 +21,10 @@ STALL_S: Final = 1.0
 """After this time without movement a lockstep reports which members it waits for, and goes on waiting [s]."""
 BATCH_BYTES: Final = 12_000
 """Size of a batch of copies in virtual time [bytes], about; batches need far fewer deliveries than single messages."""
-MAX_BATCHES: Final = 4
+BATCH_NS: Final = 80_000_000
+"""Run time that a batch spans at most [ns].  Batches that are not sent are lost if the process is killed: with those that wait
+this must stay below 0.2 s."""
+MAX_BATCHES: Final = 2
 """Number of batches that may wait for a slow receiver of copies; with more the role waits, too."""
 STRETCH: Final = 64
 """Number of stages that run in Zenoh's thread at a stretch.  A longer sequence goes on in the main thread, so that Zenoh's
@@ -33,11 +37,24 @@ OnWait = Callable[[int, list[int]], None]
 class LockstepRunner(Runner):
     """One role of a plan in virtual time."""
 
-    def __init__(self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool) -> None:
+    def __init__(
+        self, role: Role, plan: Plan, session: Session, run: str, *, watched: bool, frames: Fits | None = None
+    ) -> None:
         self._in_handler = False  # True: the handler moves the role; False: the main thread does
         self._moved = 0  # stages passed so far, to see whether the role moves at all
         mailbox = Mailbox(role, plan, paced=True)
-        super().__init__(role, plan, session, run, mailbox, watched=watched, batch_bytes=BATCH_BYTES)
+        super().__init__(
+            role,
+            plan,
+            session,
+            run,
+            mailbox,
+            watched=watched,
+            batch_bytes=BATCH_BYTES,
+            batch_ns=BATCH_NS,
+            virtual=True,
+            frames=frames,
+        )
 
     def run(self, on_wait: OnWait) -> None:
         """Runs the plan in virtual time, as fast as messages come.  After `STALL_S` without movement, and again after each
@@ -57,7 +74,7 @@ class LockstepRunner(Runner):
                 self._take_aside()
                 self._in_handler = not self._advance()
                 # read under the lock: later the handler may finish, and leave a batch to send
-                finished = self._finished
+                finished = self._finished or self._halted
             if self._failure is not None:
                 raise self._failure
             if self._copies is not None:
@@ -84,6 +101,9 @@ class LockstepRunner(Runner):
         self._idle = False
         return woken
 
+    def _now_ns(self) -> int:
+        return self._time_ns
+
     def _take(self, message: Message) -> None:
         self._mailbox.deliver(message)
 
@@ -97,14 +117,16 @@ class LockstepRunner(Runner):
         over or has failed, `STRETCH` stages have run, or `MAX_BATCHES` wait."""
         mailbox, stages, copies = self._mailbox, self._stages, self._copies
         for _ in range(STRETCH):
-            if self._finished or self._failure is not None:
+            if self._finished or self._halted or self._failure is not None:
                 return True
             number, stage = stages[self._at]
             if self._time_ns % stage.period_ns == 0:
-                if mailbox.missing(number, self._time_ns):
+                if not mailbox.is_complete(number, self._time_ns):
                     return False
-                if self._run_stage(number, stage):
-                    self._wake.set()  # a batch is complete, and the main thread sends it
+                for at_ns, heard in mailbox.acts(number, self._time_ns):
+                    for message in stage.run(at_ns, heard):
+                        if self._send(message):
+                            self._wake.set()  # a batch is complete, and the main thread sends it
             self._moved += 1
             self._at += 1
             if self._at == len(stages):
@@ -116,11 +138,3 @@ class LockstepRunner(Runner):
             if copies is not None and len(copies.batches) >= MAX_BATCHES:
                 return True
         return True
-
-    def _run_stage(self, number: int, stage: Stage) -> bool:
-        """Runs a stage that is due in a lockstep, and sends its messages; returns True if this completes a batch of copies."""
-        complete = False
-        for at_ns, heard in self._mailbox.acts(number, self._time_ns):
-            for message in stage.run(at_ns, heard):
-                complete |= self._send(message)
-        return complete

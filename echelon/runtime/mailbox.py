@@ -34,7 +34,8 @@ import numpy as np
 
 from echelon.messages import Heard, Message
 from echelon.plan.can_plan import NEVER_NS
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.role import Acts, Input, Role, Stage
 from echelon.runtime.link import Link, LinkCounts
 
@@ -56,7 +57,6 @@ class _Slot:
     first_ns: int
     period_ns: int
     timeout_ns: int
-    size: int | None
     clocks_are_true: bool
     """As in `plan`; they stand here because they are read at every message"""
     ahead_ns: int | None
@@ -87,7 +87,6 @@ class Mailbox:
                 link.first_ns,
                 link.period_ns,
                 link.timeout_ns,
-                link.size,
                 link.clocks_are_true,
                 max(MAX_AHEAD * min(tick_ns, link.period_ns), 2 * tick_ns, 2 * link.period_ns)
                 if paced and not link.prompt
@@ -104,38 +103,32 @@ class Mailbox:
         nominal instants"""
         self._acted_ns = -1 << 62
         """Instant of the role's last act"""
-        self.unexpected = 0
-        """How many messages came that belong to no link of this role"""
-        self.misshapen = 0
-        """How many messages came with a wrong number of values for their link"""
 
     def _slot(self, slot_input: Input) -> _Slot:
         return self._slots[slot_input.channel, slot_input.source]
 
     def deliver(self, message: Message) -> None:
-        """Takes a message; the order does not matter.  Messages of no link and of a wrong size are counted and dropped."""
-        if (slot := self._place(message)) is not None:
-            slot.newer[message.sequence] = message
-
-    def _place(self, message: Message) -> _Slot | None:
-        """Returns the input that a message is for; None if it is of no use: of no link, of a wrong size, old, or lost."""
-        slot = self._slots.get((message.channel, message.source))
-        if slot is None:
-            self.unexpected += 1
-            return None
+        """Takes a message of one of the role's links; the order does not matter.  What comes from other processes has passed an
+        `echelon.runtime.admission`."""
+        slot = self._slots[message.channel, message.source]
         number = message.sequence
-        if message.values.size != slot.size and message.values.size and slot.size is not None:
-            self.misshapen += 1
-            return None
         if number > slot.newest:
             slot.newest = number
-        if number <= slot.in_use or (not slot.prompt and slot.link.is_lost(number)):
-            return None
-        return slot
+        if number > slot.in_use and (slot.prompt or not slot.link.is_lost(number)):  # else it is of no use
+            slot.newer[number] = message
+
+    def is_complete(self, stage: int, time_ns: int) -> bool:
+        """Returns whether nothing is missing that the stage needs for its period from `time_ns` on, so that it can run."""
+        if not self.prompt[stage]:
+            return not self.missing(stage, time_ns)
+        for slot in self._stage_slots[stage]:  # as `missing`, up to the first message
+            number = (time_ns - slot.first_ns) // slot.period_ns
+            if number > slot.in_use and number not in slot.newer:
+                return False
+        return True
 
     def missing(self, stage: int, time_ns: int) -> list[Link]:
-        """Returns the links that miss a message which the stage needs for its period from `time_ns` on; the list is empty if
-        the stage can run."""
+        """Returns the links that miss a message which the stage needs for its period from `time_ns` on."""
         waiting = []
         until_ns = self._last_ns(self._stages[stage], time_ns)
         for slot in self._stage_slots[stage]:
@@ -197,7 +190,7 @@ class Mailbox:
             current = slot.current
             if current is None or not current.values.size:
                 heard.append(None)
-            elif slot.timeout_ns < (
+            elif slot.timeout_ns < NEVER_NS and slot.timeout_ns < (
                 time_ns - current.time_ns if slot.clocks_are_true else slot.plan.read_age_ns(time_ns, current.time_ns)
             ):
                 zeros = slot.plan.policy == "zero"

@@ -9,10 +9,12 @@ process gets to it later.  So what it takes to compute is part of the time that 
 """
 
 import time
+from collections.abc import Callable
 
 from echelon.messages import Message
 from echelon.plan.plan import Plan
 from echelon.role import Acts, Role, Stage
+from echelon.runtime.admission import EARLY_NS
 from echelon.runtime.arrivals import END, FLUSH_NS, ArrivalFile, pack_arrival
 from echelon.runtime.runner import Runner
 from echelon.runtime.session import Session
@@ -20,7 +22,10 @@ from echelon.runtime.wall_mailbox import WallMailbox, allowed_ns
 
 
 class PacedRunner(Runner):
-    """One role of a plan on a wall clock.  It notes the arrivals of its messages in `arrivals`, if that is given."""
+    """One role of a plan on a wall clock.  It notes the arrivals of its messages in `arrivals`, if that is given.
+
+    At each step it calls `beat` with the present instant and the one at which it goes on at the latest, both on the monotonic
+    clock [ns].  `every_ns` as for `Runner`."""
 
     def __init__(
         self,
@@ -31,16 +36,29 @@ class PacedRunner(Runner):
         *,
         watched: bool,
         arrivals: ArrivalFile | None = None,
+        beat: Callable[[int, int], None] = lambda now_ns, due_ns: None,
+        every_ns: int = 0,
     ) -> None:
         self._inbox = WallMailbox(role, plan, noted=arrivals is not None)
-        self._arrivals = arrivals
+        self._arrivals, self._beat = arrivals, beat
         self._written_ns = 0  # run time of the last write of arrivals
         self._started = False
         self._start_ns = 0  # run time 0 in `time.monotonic_ns`
         self._has_acted = False  # the stage at `_at` has acted, and acts again when something arrives
         self._allowed_ns = [allowed_ns(plan, stage) for stage in role.stages]
         """For each stage how long after it is due it acts at the latest [ns]"""
-        super().__init__(role, plan, session, run, self._inbox, watched=watched, batch_bytes=0)
+        super().__init__(
+            role,
+            plan,
+            session,
+            run,
+            self._inbox,
+            watched=watched,
+            batch_bytes=0,
+            batch_ns=0,
+            virtual=False,
+            every_ns=every_ns,
+        )
 
     def run(self, start_ns: int) -> None:
         """Runs the plan with run time 0 at `start_ns` of `time.monotonic_ns`.
@@ -52,19 +70,25 @@ class PacedRunner(Runner):
         while True:
             with self._lock:
                 self._take_aside()
-                wake_ns = self._pace()
+                wake_ns = self._step()
             if self._failure is not None:
                 raise self._failure
-            if self._finished:
+            if self._finished or self._halted:
                 return
             self._write_arrivals(FLUSH_NS)
             self._rest(wake_ns)
+
+    def _step(self) -> int:
+        """Does the same as `_pace`, with a beat."""
+        wake_ns = self._pace()
+        self._beat(time.monotonic_ns(), wake_ns)
+        return wake_ns
 
     def _pace(self) -> int:
         """Runs the stages that are due; returns the instant of `time.monotonic_ns` at which it must be called again, even if
         nothing is received until then."""
         mailbox, counts, start_ns = self._inbox, self.counts, self._start_ns
-        while not self._finished:
+        while not (self._finished or self._halted):
             due_ns = self._time_ns
             if time.monotonic_ns() - start_ns < due_ns:
                 return start_ns + due_ns
@@ -117,13 +141,16 @@ class PacedRunner(Runner):
         self.counts.late += self._inbox.misses(number, self._time_ns)
         return None
 
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() - self._start_ns if self._started else EARLY_NS
+
     def _take(self, message: Message) -> None:
         # what comes before the start is known counts as having come when it was sent
         self._inbox.receive(message, time.monotonic_ns() - self._start_ns if self._started else message.time_ns)
 
     def _go_on(self) -> None:
         if self._started and self._failure is None:
-            self._pace()
+            self._step()
 
     def _write_arrivals(self, after_ns: int) -> None:
         """Writes the arrivals that are not in the file yet, if the last time was `after_ns` ago."""

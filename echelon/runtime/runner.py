@@ -8,15 +8,18 @@ messages that come while the main thread moves the role are put aside, and the m
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from math import gcd
 
-from echelon.messages import Message
+from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role
+from echelon.runtime.admission import Admission, Fits, Refusals
+from echelon.runtime.admission_rules import admissions_into
 from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.session import Publisher, Session
-from echelon.runtime.wire import WireError, count_refusal, data_key, decode, encode, join, watch_key
+from echelon.runtime.wire import data_key, encode, join, watch_key
 
 
 @dataclass(slots=True)
@@ -25,8 +28,8 @@ class RunnerCounts:
 
     messages: int = 0
     """Messages sent"""
-    refused: dict[str, int] = field(default_factory=dict)
-    """Received payloads that were not messages for this role, by reason"""
+    thinned: int = 0
+    """Messages that were not copied to recorders, by rule (wall clock)"""
     late: int = 0
     """Stages that ran at their deadline with an input missing, or got nothing newer in a whole period (wall clock)"""
     stages: int = 0
@@ -36,20 +39,26 @@ class RunnerCounts:
 
 
 class CopyBatcher:
-    """Gathers copies of a member's messages into batches of about `limit` bytes, for the recorder and other observers."""
+    """Gathers copies of a member's messages into batches, for the recorder and other observers.
 
-    def __init__(self, publisher: Publisher, limit: int) -> None:
-        self._put, self._limit = publisher.put, limit
+    A batch is complete when it has `limit` bytes or spans `span_ns` of run time.  If the process is killed before, the batch is
+    lost."""
+
+    def __init__(self, publisher: Publisher, limit: int, span_ns: int) -> None:
+        self._put, self._limit, self._span_ns = publisher.put, limit, span_ns
+        self._first_ns = 0
         self._payloads: list[bytes] = []
         self._size = 0
         self.batches: list[bytes] = []
         """Complete batches that are not sent yet"""
 
-    def add(self, payload: bytes) -> bool:
-        """Adds a copy of one message; returns True if this completes a batch."""
+    def add(self, payload: bytes, time_ns: int) -> bool:
+        """Adds a copy of a message, sent at `time_ns` of run time; returns True if this completes a batch."""
+        if not self._payloads:
+            self._first_ns = time_ns
         self._payloads.append(payload)
         self._size += len(payload)
-        return self._size >= self._limit and self.close()
+        return (self._size >= self._limit or time_ns - self._first_ns >= self._span_ns) and self.close()
 
     def close(self) -> bool:
         """Completes the batch in progress; returns False if it is empty."""
@@ -70,7 +79,9 @@ class CopyBatcher:
 class Runner(ABC):
     """One role of a plan, connected to a session.  The constructor declares all that the role sends and receives.
 
-    `watched` sends copies of its messages to observers, in batches of about `batch_bytes`."""
+    `watched` sends copies of its messages to observers, in batches of about `batch_bytes` that span `batch_ns` at most.  With
+    `every_ns` only the first message of each channel in every such time is copied, and the others are counted as thinned.
+    `frames` are the bounds of frames that it receives."""
 
     def __init__(
         self,
@@ -82,6 +93,10 @@ class Runner(ABC):
         *,
         watched: bool,
         batch_bytes: int,
+        batch_ns: int,
+        virtual: bool,
+        frames: Fits | None = None,
+        every_ns: int = 0,
     ) -> None:
         members = plan.all_roles
         member = members[role.index]
@@ -92,7 +107,11 @@ class Runner(ABC):
         self._puts = {channel: session.publisher(data_key(run, member.path, channel)).put for channel in channels}
         self._copies: CopyBatcher | None = None
         if watched:
-            self._copies = CopyBatcher(session.publisher(watch_key(run, member.role, member.name)), batch_bytes)
+            publisher = session.publisher(watch_key(run, member.role, member.name))
+            self._copies = CopyBatcher(publisher, batch_bytes, batch_ns)
+        self._every_ns = every_ns
+        self._copied: dict[Channel, int] = {}
+        """The number of the time `every_ns` in which a message of a channel was last copied"""
         self._tick_ns = gcd(*[stage.period_ns for stage in role.stages])
         self._stages = list(enumerate(role.stages))
 
@@ -101,21 +120,27 @@ class Runner(ABC):
 
         # The thread that holds the lock may use the mailbox and move the role.
         self._lock = threading.Lock()
-        self._aside: deque[bytes] = deque()  # payloads that came while the main thread had the lock
+        self._aside: deque[Message] = deque()  # messages that came while the main thread had the lock
         self._wake = threading.Event()  # set when the main thread has work
         self._time_ns = min(stage.first_ns for stage in role.stages)
         self._at = 0  # the stage that runs next at this instant
         self._finished = False
+        self._halted = False  # the run breaks off
         self._failure: BaseException | None = None
 
-        inputs = {slot_input for stage in role.stages for slot_input in stage.inputs}
-        keys = sorted(data_key(run, members[one.source].path, one.channel) for one in inputs)
-        session.subscribe(keys, self._receive)
+        self.refusals = Refusals()
+        for admission in admissions_into(plan, role.index, self.refusals, virtual=virtual, frames=frames):
+            key = data_key(run, members[admission.source].path, admission.channel)
+            session.subscribe(key, partial(self._receive, admission))
 
     @property
     def mailbox(self) -> Mailbox:
         """The mailbox of the role."""
         return self._mailbox
+
+    @abstractmethod
+    def _now_ns(self) -> int:
+        """Returns the run time at which the role is, for the admission of messages."""
 
     @abstractmethod
     def _take(self, message: Message) -> None:
@@ -125,16 +150,21 @@ class Runner(ABC):
     def _go_on(self) -> None:
         """Moves the role in Zenoh's thread, after a message."""
 
-    def _receive(self, payload: bytes) -> None:
-        """Takes a payload in Zenoh's thread, and moves the role as far as that lets it."""
+    def _receive(self, admission: Admission, payload: bytes) -> None:
+        """Takes a payload in Zenoh's thread, and moves the role as far as that lets it.
+
+        Only this thread admits messages, so it needs no lock for that."""
+        message = admission.admit(payload, self._now_ns())
+        if message is None:
+            return
         if not self._lock.acquire(blocking=False):
-            self._aside.append(payload)
+            self._aside.append(message)
             self._wake.set()
             return
         try:
             if self._aside:
                 self._take_aside()
-            self._deliver(payload)
+            self._take(message)
             self._go_on()
         except BaseException as error:  # Zenoh would drop it; the main thread raises it
             self._failure = error
@@ -143,25 +173,24 @@ class Runner(ABC):
             self._lock.release()
 
     def _take_aside(self) -> None:
-        """Delivers the payloads that were put aside."""
+        """Puts the messages into the mailbox that were put aside."""
         while self._aside:
-            self._deliver(self._aside.popleft())
-
-    def _deliver(self, payload: bytes) -> None:
-        """Puts a payload into the mailbox, or counts why it is refused."""
-        try:
-            message = decode(payload)
-        except WireError as error:
-            count_refusal(self.counts.refused, error.reason)
-            return
-        self._take(message)
+            self._take(self._aside.popleft())
 
     def _send(self, message: Message) -> bool:
         """Sends a message; returns True if that completes a batch of copies."""
         payload = encode(message)
         self.counts.messages += 1
         self._puts[message.channel](payload)
-        return self._copies is not None and self._copies.add(payload)
+        if self._copies is None:
+            return False
+        if self._every_ns:
+            number = message.time_ns // self._every_ns
+            if number == self._copied.get(message.channel):
+                self.counts.thinned += 1
+                return False
+            self._copied[message.channel] = number
+        return self._copies.add(payload, message.time_ns)
 
     def stop(self) -> None:
         """Ends the run early, for a signal handler in the main thread: raises SystemExit there, at once if it waits, otherwise
@@ -171,16 +200,19 @@ class Runner(ABC):
             self._idle = False
             raise SystemExit(0)
 
+    def halt(self, timeout_s: float) -> None:
+        """Stops the role for good, from any thread.  If it is in the middle of a stage for longer than `timeout_s`, it stops
+        after that stage."""
+        locked = self._lock.acquire(timeout=timeout_s)
+        self._halted = True
+        self._wake.set()
+        if locked:
+            self._lock.release()
+
     def finish(self) -> None:
-        """Stops the role for good, sends the copies that are left, and completes the counts."""
+        """Stops the role for good, and sends the copies that are left."""
         with self._lock:
             self._finished = True
-            for reason, count in (
-                ("of no link of this role", self._mailbox.unexpected),
-                ("wrong number of values", self._mailbox.misshapen),
-            ):
-                if count:
-                    self.counts.refused[reason] = count
             if self._copies is not None:
                 self._copies.close()
         if self._copies is not None:

@@ -16,11 +16,10 @@ import random
 import socket
 import sys
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self, TypeVar
 
 # Zenoh reads this once, when the first session opens.  With a second worker thread each message would wake one more thread.
 os.environ.setdefault(
@@ -31,6 +30,7 @@ os.environ.setdefault(
 import zenoh
 
 from echelon.runtime.credentials import Credentials
+from echelon.runtime.inbox import Inbox
 
 Receive = Callable[[bytes], None]
 """Handler of one payload, called in Zenoh's thread.  While it runs nothing else is received, so it must not wait for a later
@@ -39,52 +39,13 @@ payload.  It must handle its own errors, because Zenoh drops them."""
 LEASE_MS: Final = 120_000
 """Peers close the connection to a process that stands still for longer than this [ms].  If a process ends, its peers notice
 that at once, because its sockets close."""
+LARGEST_MESSAGE: Final = 1 << 24
+"""Larger payloads are not received; those of a run are a few kilobytes [bytes]"""
+MOST_TOKENS: Final = 1 << 16
+"""Tokens beyond this number are not noted"""
 _SUN_PATH: Final = 107  # bytes in the path of a Unix socket
 _thread: Final = threading.local()
-
-
-class Inbox:
-    """Payloads received and not yet taken, in order of arrival.  Only one thread may call `take`.
-
-    With `hold` (lockstep), nothing more is received while the inbox holds `high_water` payloads: senders block in their put,
-    and nothing is lost.  Without it the newest `high_water` payloads are kept, and `dropped` counts the others.
-    """
-
-    def __init__(self, high_water: int, hold: bool) -> None:
-        self._payloads: deque[bytes] = deque()
-        self._high_water, self._hold = high_water, hold
-        self._some = threading.Event()
-        self._room = threading.Event()
-        self.dropped = 0
-
-    def take(self, timeout_s: float | None = None) -> list[bytes]:
-        """Removes and returns all payloads.  If there are none, it first waits for one, at most `timeout_s`; None waits for
-        ever."""
-        payloads = self._payloads
-        if not payloads and timeout_s != 0:
-            self._some.clear()  # cleared before the second look: a payload that comes after it sets the event again
-            if not payloads:
-                self._some.wait(timeout_s)
-        taken = [payloads.popleft() for _ in range(len(payloads))]
-        self._room.set()
-        return taken
-
-    def _receive(self, payload: bytes) -> None:
-        payloads = self._payloads
-        payloads.append(payload)
-        if not self._hold and len(payloads) > self._high_water:
-            payloads.popleft()
-            self.dropped += 1
-        self._some.set()
-        while self._hold and len(payloads) >= self._high_water:
-            self._room.clear()
-            if self._hold and len(payloads) >= self._high_water:
-                self._room.wait()
-
-    def _let_go(self) -> None:
-        """Ends the holding of senders.  Zenoh's thread may be blocked in `_receive`, and closing a session needs it."""
-        self._hold = False
-        self._room.set()
+_T = TypeVar("_T")
 
 
 class Publisher:
@@ -128,7 +89,7 @@ class Tokens:
         with self._changed:
             if lost:
                 self._alive.discard(key)
-            else:
+            elif len(self._alive) < MOST_TOKENS:
                 self._alive.add(key)
             self._changed.notify_all()
         if lost and self._on_lost is not None:
@@ -163,7 +124,7 @@ class Session:
             os.environ["ZENOH_RUNTIME"] = runtime.replace("rx:(handover:app)", "rx:(worker_threads:1)")
         self._lockstep = lockstep
         self._session = _open(listen, connect, lockstep, credentials)
-        self._inboxes: list[Inbox] = []
+        self._inboxes: list[Inbox[Any]] = []
         self._kept: list[object] = []  # references that keep all declarations alive as long as the session
 
     def subscribe(self, keys: str | Iterable[str], receive: Receive) -> None:
@@ -181,16 +142,37 @@ class Session:
             handler = zenoh.handlers.Callback(handle, indirect=False)
             self._kept.append(self._session.declare_subscriber(key, handler))
 
-    def inbox(self, keys: str | Iterable[str], high_water: int = 1024) -> Inbox:
+    def inbox(self, keys: str | Iterable[str], high_water: int = 1024) -> Inbox[bytes]:
         """Returns an inbox for the payloads put under any of `keys`.
 
         In lockstep, a full inbox blocks everything that this process receives.  So its owner must keep calling `take`, and
         must not wait for anything else."""
+        inbox: Inbox[bytes] = self._new_inbox(high_water)
+        self.subscribe(keys, inbox.put)
+        return inbox
+
+    def checked_inbox(self, doors: Mapping[str, Callable[[bytes], _T | None]], high_water: int = 1024) -> Inbox[_T]:
+        """Returns an inbox for what was put under any of the keys of `doors`.
+
+        The function of a key is called in Zenoh's thread with each payload and returns what is to be kept of it, or None."""
+        inbox: Inbox[_T] = self._new_inbox(high_water)
+
+        def receiver(check: Callable[[bytes], _T | None]) -> Receive:
+            def receive(payload: bytes) -> None:
+                if (kept := check(payload)) is not None:
+                    inbox.put(kept)
+
+            return receive
+
+        for key, check in doors.items():
+            self.subscribe(key, receiver(check))
+        return inbox
+
+    def _new_inbox(self, high_water: int) -> Inbox[Any]:
         # Zenoh's thread needs Python's global lock for each payload; by default a busy thread gives it up only every 5 ms.
         sys.setswitchinterval(1e-4)
-        inbox = Inbox(high_water, self._lockstep)
+        inbox: Inbox[Any] = Inbox(high_water, self._lockstep)
         self._inboxes.append(inbox)
-        self.subscribe(keys, inbox._receive)
         return inbox
 
     def publisher(self, key: str) -> Publisher:
@@ -217,7 +199,7 @@ class Session:
 
         On a wall clock it gives up on a receiver that stands still."""
         for inbox in self._inboxes:
-            inbox._let_go()
+            inbox.let_go()
         try:
             self._session.close()  # type: ignore[no-untyped-call]
         except zenoh.ZError:  # it took too long
@@ -276,6 +258,7 @@ def _open(
         # Each received message holds one 64 KiB buffer until it is taken.  With a single buffer (the default) nearly every
         # message allocates and clears a new one.
         "transport/link/rx/buffer_size": 4 * 65536,
+        "transport/link/rx/max_message_size": LARGEST_MESSAGE,
     }
     if lockstep:
         # A peer that stands still is waited for, and what was put for it is kept; the run's supervisor decides when to give up.

@@ -30,14 +30,15 @@ class WallMailbox(Mailbox):
         """Arrivals that are not in the file yet"""
 
     def receive(self, message: Message, time_ns: int) -> None:
-        """Takes a message that comes at `time_ns`.  Messages of no link and of a wrong size are counted and dropped."""
-        slot = self._place(message)
-        if slot is None or message.sequence in slot.newer:
+        """Takes a message of one of the role's links that comes at `time_ns`."""
+        slot, number = self._slots[message.channel, message.source], message.sequence
+        slot.newest = max(slot.newest, number)
+        if number <= slot.in_use or number in slot.newer or slot.link.is_lost(number):
             return
         arrives_ns = slot.link.receive(message, time_ns)
         if arrives_ns is None:
             return
-        slot.newer[message.sequence] = message
+        slot.newer[number] = message
         self._note(message, arrives_ns)
 
     def _note(self, message: Message, arrives_ns: int) -> None:

@@ -15,8 +15,6 @@ from echelon.messages import Channel, Message
 
 SCHEMA_VERSION: Final = 1
 HEADER: Final = struct.Struct("<HBBIQqII")
-REASONS: Final = 32
-"""Largest number of different reasons by which refusals are counted."""
 _CHANNELS: Final = {int(channel): channel for channel in Channel}
 _LENGTH: Final = struct.Struct("<I")
 _VERSION: Final = struct.Struct("<H")
@@ -29,19 +27,11 @@ _channel_of: Final = _CHANNELS.get
 
 
 class WireError(ValueError):
-    """A payload is not a valid message.  `reason` is short, and refusals are counted by it."""
+    """A payload is not a valid message.  `reason` is short; refusals are counted by it (`echelon.runtime.admission`)."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
-
-
-def count_refusal(counts: dict[str, int], reason: str) -> None:
-    """Counts a refusal by its reason in `counts`.  After `REASONS` different reasons all new ones count as "other reasons", so
-    that random bytes cannot make `counts` grow without bound."""
-    if reason not in counts and len(counts) >= REASONS:
-        reason = "other reasons"
-    counts[reason] = counts.get(reason, 0) + 1
 
 
 def encode(message: Message) -> bytes:
@@ -73,12 +63,12 @@ def _refusal(payload: bytes) -> WireError:
     if len(payload) >= _VERSION.size:
         (version,) = _VERSION.unpack_from(payload)
         if version != SCHEMA_VERSION:
-            return WireError(f"schema version {version}, here {SCHEMA_VERSION}")
+            return WireError("another schema version")
     if len(payload) < _HEADER_SIZE:
         return WireError("too short")
     _, number, zero, _, _, _, _, zeros = _unpack(payload)
     if number not in _CHANNELS:
-        return WireError(f"unknown channel {number}")
+        return WireError("unknown channel")
     return WireError("reserved bytes are not zero" if zero or zeros else "length does not match")
 
 

@@ -26,8 +26,9 @@ class DriveTable(Table):
     """The drives and motors of a robot's wheels.  Both wheels have the same values."""
 
     protocol: ProtocolField = None
-    """`native` (one frame for both wheels, counter and CRC; the default), `odrive` (CANSimple 0.6), `cia402` (cyclic
-    synchronous torque over CANopen), or your own"""
+    """`native` (one frame for both wheels, counter and CRC; the default), `odrive` (CANSimple 0.6; its parameter `control_mode`
+    is the mode that is stored in a virtual drive, `position` unless given, or `torque`), `cia402` (cyclic synchronous torque
+    over CANopen), or your own"""
     node_ids: tuple[NodeId, NodeId] | None = None
     """Node ids of the right and the left wheel's drive; unless given, the lowest ids whose identifiers are free on the bus"""
     recover_after: Seconds | None = None

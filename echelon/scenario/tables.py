@@ -2,30 +2,24 @@
 
 A robot's values come from three levels: `[robot]` for all robots, `robot` of its group and of the groups around that, and the
 robot's own table.  `echelon.planning.loading` reads files, applies overrides and explains mistakes;
-`echelon.planning.plan_maker` makes the plan that roles work with.  `echelon.scenario.can_tables` has the tables of the CAN bus,
-`echelon.scenario.link_tables` those of links.
+`echelon.planning.plan_maker` makes the plan that roles work with.  `echelon.scenario.law_tables` has the tables of the law and
+of avoidance, `echelon.scenario.link_tables` those of links, `echelon.scenario.can_tables` those of the CAN bus.
 """
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, SerializationInfo, field_serializer, model_validator
+from pydantic import Field, model_validator
 
 from echelon.parameters import Finite, NonNegative, Point, Positive
 from echelon.scenario.can_tables import BusOff, Can, DriveFault, DriveTable, EnvelopeTable, ErrorFrames, Estop
+from echelon.scenario.law_tables import Avoidance, Law
 from echelon.scenario.link_tables import Blackout, Clock, CutOff, LinkRule
 from echelon.scenario.part_fields import (
-    LawName,
-    LawParameters,
     PlantField,
     TrajectoryField,
-    WrittenLawName,
-    written_use,
 )
 from echelon.scenario.values import (
-    CouplingGain,
-    Flag,
     Fraction,
-    Gain,
     Limit,
     Name,
     Seconds,
@@ -163,80 +157,6 @@ class Group(Table):
         return self
 
 
-class Gains(Table):
-    """Gains of blocks before division by their time scale σ: K_1 = k1/σ², K_2 = k2/σ (docs/architecture.md, 2.4)."""
-
-    block: str = "*"
-    """The blocks: a name (`g1`, `inter`, `centroid`), a layer (`intra`), or `*`"""
-    k1: Gain = 1.0
-    """Gain of the error: a number, or a full matrix of the block"""
-    k2: Gain = 1.0
-    """Gain of the error's rate: a number, or a full matrix of the block"""
-
-
-class Coupling(Table):
-    """Velocity coupling K̄: the error rates of one block act on another block (docs/architecture.md, 2.4)."""
-
-    block: str = "*"
-    """The blocks that are acted on: a name, a layer, or `*`"""
-    onto: str = "*"
-    """The blocks whose error rates act: a name, a layer, or `*`"""
-    value: CouplingGain
-    """Entries of K̄ for each pair of these blocks: a number for every entry, or the full matrix"""
-
-
-class Law(Table):
-    """The control law: time scales, gains and coupling of the blocks.  The blocks are the shapes of all nodes and the centroid
-    (docs/architecture.md, 2.4)."""
-
-    use: LawName = Field(default="linear", validate_default=True)
-    """`linear` (the paper's), `integral`, `terminal_sliding`, or a law of your own (docs/add-a-law.md)"""
-    parameters: LawParameters = Field(default_factory=dict, validate_default=True)
-    """Parameters of the law that `use` names"""  # validation turns them into the law itself, a Part
-    time_scales: Literal["three", "multi"] = "three"
-    """`three`: one time scale for each layer of the tree.  `multi`: one for each node; the groups settle in their order"""
-    epsilon: Annotated[list[Annotated[float, Field(strict=True, gt=0, le=1)]], Field(min_length=1)] = [0.7, 0.7]
-    """ε_1, ε_2, …: the time scale σ of a block is the product of the first few.  `three` needs as many as the tree has layers
-    of nodes, `multi` as many as there are nodes: the groups and the formation"""
-    gains: list[Gains] = []
-    """Gains of blocks, for laws that use them; later entries override earlier ones"""
-    coupling: list[Coupling] = []
-    """Coupling of blocks; later entries override earlier ones.  Without entries no block is coupled"""
-    lead: Fraction = 0.0
-    """λ, how far ahead the law looks, in acceleration periods, for laws that use it (docs/architecture.md, 2.5).  With 0 the
-    law does not look ahead; 0.5 compensates for the hold of the accelerations"""
-    reference: Literal["message", "now"] = "message"
-    """The reference that a state is compared with (docs/architecture.md, 2.5).  `message`: that of the time of the state's
-    message.  `now`: that of the instant at which the node acts; then a delay τ leaves a steady lag, velocity × τ, in a moving
-    formation"""
-
-    @field_serializer("use")
-    def _use(self, use: str, info: SerializationInfo) -> WrittenLawName:
-        return written_use(self.parameters, info)
-
-
-class Avoidance(Table):
-    """Collision avoidance: a potential pushes robots apart that are closer than `sensing_radius` (docs/architecture.md,
-    2.6)."""
-
-    enabled: Flag = False
-    """False: robots do not avoid each other; a distance of at most `avoidance_radius` is still a violation"""
-    avoidance_radius: Positive = 0.25
-    """r_a: a distance of two robots of at most this is a violation [m]"""
-    sensing_radius: Positive = 1.0
-    """R_s: two robots push each other apart if their distance is below this [m]"""
-    force_limit: Positive = 1e4
-    """Largest ∇f of one pair [m/s²]; it acts also within r_a, where the potential is not defined"""
-
-    @model_validator(mode="after")
-    def _radii(self) -> "Avoidance":
-        if self.sensing_radius <= self.avoidance_radius:
-            raise ValueError(
-                f"sensing_radius = {self.sensing_radius} must be larger than avoidance_radius = {self.avoidance_radius}"
-            )
-        return self
-
-
 class Record(Table):
     """The recording."""
 
@@ -271,10 +191,12 @@ CheckName = Literal[
     "saturation",
     "messages",
     "silence",
+    "standstill",
     "refused",
     "late",
     "drives",
     "referee",
+    "senders",
     "recording",
 ]
 
@@ -286,9 +208,12 @@ class Health(Table):
     the run.  `end`: no block ends with a larger error than it started with.  `distance`, if avoidance is off: robots keep
     `avoidance.avoidance_radius` nevertheless.  `avoidance`, if it is on: robots keep that radius, and avoidance acted at least
     once.  `saturation`: no robot's limits act for too long.  `messages`: on every link messages arrive and are used.
-    `silence`: no robot is silent for too long.  `refused`: no message is refused.  `late`, on a wall clock: stages run in time.
+    `silence`: no robot is silent for too long.  `standstill`, on a wall clock: no process stands still for longer than
+    `can.watchdog`, or `silence` if the run has no bus.  `refused`: no message is refused.  `late`, on a wall clock:
+    stages run in time.
     `drives`, if the torque path is closed: all drives come up, and at the end no drive has a fault without an event that
-    explains it.  `referee`: nothing on the bus breaks the contract.  `recording`: the recording is complete"""
+    explains it.  `referee`: nothing on the bus breaks the contract.  `senders`: nobody else sends frames with identifiers of
+    the run.  `recording`: the recording is complete"""
 
     off: list[CheckName] = []
     """Checks that are left out"""

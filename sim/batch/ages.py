@@ -149,7 +149,7 @@ def find_percentiles(link: Any, run: Any, whole: Any) -> None:
         age_ns = 0
         if zeros < enough:
             if count <= LISTED and not rough:
-                age_ns = whole[link.ages_at + max(0, ceil(enough) - zeros - 1)]
+                age_ns = whole[link.ages_at + max(0, int(ceil(enough)) - zeros - 1)]  # noqa: RUF046
             else:
                 counts = link.bins_at if rough else link.uses_at
                 while total - above - whole[counts + at] >= enough:

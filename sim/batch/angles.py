@@ -1,9 +1,9 @@
 """Cosine and sine at once.  The compiler's own functions give one of them at a time, which takes twice as long."""
 
-from math import cos, floor, sin
+from math import atan2, cos, floor, sin
 from typing import Final
 
-from echelon.sim.batch.compiled import fused
+from echelon.sim.batch.compiled import apart, fused
 
 _PER_QUARTER: Final = 6.36619772367581382433e-01
 _QUARTER: Final = 1.57079632673412561417e00
@@ -33,7 +33,7 @@ def cos_sin(angle: float) -> tuple[float, float]:
 
     The angle is reduced to ±π/4 [rad]; there the polynomials of fdlibm hold (k_sin.c, k_cos.c)."""
     if not abs(angle) < _LARGE:
-        return cos(angle), sin(angle)
+        angle = within_one_turn(angle)
     quarters = floor(angle * _PER_QUARTER + 0.5)
     x = (angle - quarters * _QUARTER) - quarters * _REST
     z = x * x
@@ -49,3 +49,9 @@ def cos_sin(angle: float) -> tuple[float, float]:
     if quadrant & 2:
         c, s = -c, -s
     return c, s
+
+
+@apart
+def within_one_turn(angle: float) -> float:
+    """Returns an angle without whole turns."""
+    return atan2(sin(angle), cos(angle))

@@ -5,7 +5,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from echelon.plan.plan import Plan
 from echelon.runtime.fates import ALL, link_key
 from echelon.sim.batch.model import ModelMaker
 from echelon.sim.batch.outcomes import TRACED, BatchRuns, Kept, outcomes
-from echelon.sim.batch.refusals import refusal
+from echelon.sim.batch.records import Model
+from echelon.sim.batch.refusals import gpu_refusal, refusal
 
 _WORD: Final = 2**64 - 1
+Device = Literal["processor", "gpu"]
 MOST_AT_ONCE: Final = 16
 """Largest number of runs that a thread takes at once"""
 PARTS: Final = 16
@@ -28,6 +30,7 @@ def run_many(
     plan: Plan,
     seeds: Sequence[int],
     *,
+    device: Device = "processor",
     threads: int | None = None,
     traces: bool = False,
     mean_squares: bool = False,
@@ -38,14 +41,18 @@ def run_many(
 
     Each run is the one that the in-process engine makes of the plan with that seed, to rounding.  It ends at the first instant
     at which a robot's state is not finite.  Runs do not depend on `threads` (by default one for each core).  `traces` asks for
-    the robots' states too, `mean_squares` for E|e|² of each block over time.  `say` gets a line when code must be compiled
-    first, `progress` the number of runs done so far.
+    the robots' states too, `mean_squares`, which only the processor can, for E|e|² of each block over time.  `say` gets a line
+    when code must be compiled first, `progress` the number of runs done so far.
 
-    Raises UsageError if there are no seeds, or if this engine cannot run the plan."""
+    Raises UsageError if there are no seeds, if this engine cannot run the plan, or if there is no such device."""
     if not seeds or (threads is not None and threads < 1):
         raise UsageError(f"{len(seeds)} seeds, {threads} threads: there must be at least one of each")
     if why := refusal(plan):
         raise UsageError(why)
+    if device == "gpu":
+        if mean_squares:
+            raise UsageError("device 'gpu': sums over runs are made by the processor only; use device 'processor'")
+        return _on_gpu(plan, seeds, traces, say, progress)
     maker = ModelMaker(plan)
     model, pools = maker.make(), maker.pools
     from echelon.sim.batch import whole_run  # the compiler, when it is needed
@@ -54,7 +61,7 @@ def run_many(
         say("compiling the batch engine: once on this machine, for about half a minute")
     keys, kept = _keys(plan, seeds), Kept.of(model)
     instants = plan.duration_ns // int(model.run["common_ns"][0]) + 1
-    traced = np.full((len(seeds) if traces else 1, instants if traces else 0, len(plan.robots), len(TRACED)), np.nan)
+    traced = _room_for_traces(plan, model, len(seeds) if traces else 0)
     reals = np.empty((len(seeds), len(kept.reals)))
     wholes = np.empty((len(seeds), len(kept.wholes)), dtype=np.int64)
     lost_ns = np.empty(len(seeds), dtype=np.int64)
@@ -107,6 +114,31 @@ def run_many(
         traced if traces else None,
         sums if mean_squares else None,
     )
+
+
+def _on_gpu(
+    plan: Plan, seeds: Sequence[int], traces: bool, say: Callable[[str], None], progress: Callable[[int], None]
+) -> BatchRuns:
+    """Runs a plan once for each seed on an NVIDIA GPU.  Raises UsageError if there is none."""
+    if why := gpu_refusal():
+        raise UsageError(why)
+    from echelon.sim.batch import gpu
+
+    if not gpu.is_kept():
+        say("compiling the batch engine for the GPU: once on this machine, for about a minute")
+    maker = ModelMaker(plan)
+    model = maker.make()
+    kept = Kept.of(model)
+    traced = _room_for_traces(plan, model, len(seeds) if traces else 0)
+    lost_ns, reals, wholes = gpu.run_on_gpu(model, maker.pools, _keys(plan, seeds), kept, traced)
+    progress(len(seeds))
+    return outcomes(plan, model, seeds, lost_ns, reals, wholes, traced if traces else None, None)
+
+
+def _room_for_traces(plan: Plan, model: Model, runs: int) -> NDArray[np.float64]:
+    """Returns room for the states of this number of runs, (max(1, runs), T, robots, len(TRACED)); T is 0 without runs."""
+    instants = plan.duration_ns // int(model.run["common_ns"][0]) + 1 if runs else 0
+    return np.full((max(1, runs), instants, len(plan.robots), len(TRACED)), np.nan)
 
 
 def _keys(plan: Plan, seeds: Sequence[int]) -> NDArray[np.int64]:

@@ -18,6 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numba
 
+from echelon.agents import plant, torque_loop
 from echelon.controller.laws import terminal_sliding
 from echelon.plan import delay_tables
 from echelon.runtime import ages, fates
@@ -67,7 +68,7 @@ def is_kept() -> bool:
 
 def sources() -> list[Path]:
     """Returns the sources of the compiled code: this room, and modules whose numbers are compiled into it."""
-    modules = terminal_sliding, delay_tables, ages, fates
+    modules = plant, torque_loop, terminal_sliding, delay_tables, ages, fates
     return [*sorted(Path(__file__).parent.glob("*.py")), *(Path(module.__file__ or "") for module in modules)]
 
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from echelon.plan.delay_tables import DelayTable, DelayTrace, factors
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.runtime.fates import normal_table
 from echelon.sim.batch import records as r
 from echelon.sim.batch.pools import Pools

@@ -11,6 +11,7 @@ from typing import Any
 
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, to_shape
+from echelon.sim.batch.memory import copy
 from echelon.sim.batch.potential import sort_along
 from echelon.sim.batch.records import (
     BLOCK_WHOLES,
@@ -28,8 +29,6 @@ from echelon.sim.batch.records import (
     OMEGA,
     SIN,
     V,
-    X,
-    Y,
 )
 
 
@@ -46,11 +45,8 @@ def measure(
     time_ns: int,
     step_ns: int,
 ) -> None:
-    """Notes the robots' positions at `time_ns`, `step_ns` after the last time (0 at the first)."""
+    """Measures at `time_ns`, `step_ns` after the last time (0 at the first)."""
     places = run.places_at
-    for robot in range(len(robots)):
-        real[places + 2 * robot] = real[robots[robot].at + X]
-        real[places + 2 * robot + 1] = real[robots[robot].at + Y]
     is_late = time_ns >= run.sooner_ns
     if is_late:
         _note_rates(run, robots, real)
@@ -59,12 +55,10 @@ def measure(
         count, z = node.count, node.f_pot_at
         for child in range(count):
             place = places + 2 * index[node.children_at + child]
-            real[node.a_at + 2 * child] = real[place]
-            real[node.a_at + 2 * child + 1] = real[place + 1]
+            real[node.a_at + 2 * child], real[node.a_at + 2 * child + 1] = real[place], real[place + 1]
         to_shape(node, 2, table, real, node.a_at, z)
         centroid = places + 2 * (len(robots) + number)
-        real[centroid] = real[z + 2 * (count - 1)]
-        real[centroid + 1] = real[z + 2 * (count - 1) + 1]
+        real[centroid], real[centroid + 1] = real[z + 2 * (count - 1)], real[z + 2 * (count - 1) + 1]
         square = 0.0
         for row in range(2 * (count - 1)):
             square += (real[z + row] - table[node.desired_at + row]) ** 2
@@ -75,11 +69,10 @@ def measure(
         if node.link < 0:
             x, y, _, _, _, _ = desired(run, table, time_ns / 1e9)
             norm = sqrt((real[centroid] - x) ** 2 + (real[centroid + 1] - y) ** 2)
-            _note_error(run, blocks[-1], table, real, whole, norm, time_ns, step_ns)
+            _note_error(run, blocks[len(blocks) - 1], table, real, whole, norm, time_ns, step_ns)
     if step_ns > 0:
         _note_distances(run, len(robots), real, whole, time_ns, step_ns)
-    for value in range(2 * len(robots)):
-        real[run.before_at + value] = real[places + value]
+    copy(real, places, run.before_at, 2 * len(robots))
     if step_ns == 0:
         _note_distances(run, len(robots), real, whole, time_ns, step_ns)
 
@@ -103,12 +96,10 @@ def _note_amplitudes(
     count, z, rates = node.count, node.f_pot_at, node.eta_at
     for child in range(count):
         place = run.rates_at + 2 * index[node.children_at + child]
-        real[node.a_at + 2 * child] = real[place]
-        real[node.a_at + 2 * child + 1] = real[place + 1]
+        real[node.a_at + 2 * child], real[node.a_at + 2 * child + 1] = real[place], real[place + 1]
     to_shape(node, 2, table, real, node.a_at, rates)
     centroid = 2 * (count - 1)
-    real[own] = real[rates + centroid]
-    real[own + 1] = real[rates + centroid + 1]
+    real[own], real[own + 1] = real[rates + centroid], real[rates + centroid + 1]
     sixth = M_SOONER + (time_ns >= run.earlier_ns) + (time_ns >= run.last_ns)
     block = blocks[node.block]
     rest = 0.0
@@ -116,7 +107,7 @@ def _note_amplitudes(
         rest += (real[rates + row] + block.alpha * (real[z + row] - table[node.desired_at + row])) ** 2
     real[block.measures_at + sixth] += square + rest * block.per_omega_squared
     if node.link < 0:
-        block = blocks[-1]
+        block = blocks[len(blocks) - 1]
         x, y, vx, vy, _, _ = desired(run, table, time_ns / 1e9)
         e_x, e_y = real[z + centroid] - x, real[z + centroid + 1] - y
         rest = (real[own] - vx + block.alpha * e_x) ** 2 + (real[own + 1] - vy + block.alpha * e_y) ** 2
@@ -128,23 +119,24 @@ def _note_error(
     run: Any, block: Any, table: Any, real: Any, whole: Any, norm: float, time_ns: int, step_ns: int
 ) -> None:
     at, marks = block.measures_at, block.marks_at
-    if step_ns == 0 or norm > real[at + M_PEAK] or (norm != norm and whole[marks + M_FINITE]):
+    before, peak, start = real[at + M_LAST], real[at + M_PEAK], real[at + M_START]
+    ise, iae, itae = real[at + M_ISE], real[at + M_IAE], real[at + M_ITAE]
+    if step_ns == 0 or norm > peak or (norm != norm and whole[marks + M_FINITE]):
         real[at + M_PEAK] = norm
         whole[marks + M_PEAK_NS] = time_ns
     if not isfinite(norm):
         whole[marks + M_FINITE] = 0
-    if time_ns <= block.response_ns and not norm <= real[at + M_START]:
-        real[at + M_START] = norm
+    if time_ns <= block.response_ns and not norm <= start:
+        real[at + M_START] = start = norm
     for number in range(run.fractions):
-        if norm > table[run.fractions_at + number] * real[at + M_START]:
+        if norm > table[run.fractions_at + number] * start:
             whole[marks + BLOCK_WHOLES + number] = time_ns
     if norm > run.floor:
         whole[marks + M_OUT_FLOOR] = time_ns
-    before = real[at + M_LAST]
     step = step_ns / 1e9
-    real[at + M_ISE] += step * (norm * norm + before * before) / 2
-    real[at + M_IAE] += step * (norm + before) / 2
-    real[at + M_ITAE] += step * (norm * (time_ns / 1e9) + before * ((time_ns - step_ns) / 1e9)) / 2
+    real[at + M_ISE] = ise + step * (norm * norm + before * before) / 2
+    real[at + M_IAE] = iae + step * (norm + before) / 2
+    real[at + M_ITAE] = itae + step * (norm * (time_ns / 1e9) + before * ((time_ns - step_ns) / 1e9)) / 2
     real[at + M_LAST] = norm
 
 
@@ -164,11 +156,11 @@ def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, 
     order = run.order_at
     axis = sort_along(robots, before, order, real, whole)
     for place in range(robots - 1):
-        one = whole[order + place]
+        one = place if axis < 0 else whole[order + place]
         x, y = real[before + 2 * one], real[before + 2 * one + 1]
         last = x + reach if axis == 0 else y + reach
         for later in range(place + 1, robots):
-            other = whole[order + later]
+            other = later if axis < 0 else whole[order + later]
             if axis >= 0 and real[before + 2 * other + axis] > last:
                 break
             x_apart, y_apart = real[before + 2 * other] - x, real[before + 2 * other + 1] - y

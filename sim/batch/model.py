@@ -1,6 +1,6 @@
 """From a plan to arrays (`records`): once for each plan, before its runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from math import ceil, gcd, lcm
 from typing import Any
@@ -13,11 +13,17 @@ from echelon.controller.laws.law import Block, law_block
 from echelon.controller.trajectory import Circle, Line, Sine
 from echelon.controller.transformation import desired_shape
 from echelon.messages import Channel
-from echelon.plan.layout import NodeLayout, acceleration_of, length
-from echelon.plan.plan import Array, BlockPlan, LinkPlan, NodePlan, Plan, RobotPlan
-from echelon.runtime.ages import EXACT
+from echelon.plan.layout import NodeLayout, length
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import (
+    Array,
+    BlockPlan,
+    NodePlan,
+    Plan,
+    RobotPlan,
+)
 from echelon.sim.batch import records as r
-from echelon.sim.batch.links import fates_of
+from echelon.sim.batch.link_model import LinkMaker
 from echelon.sim.batch.outcomes import fractions, late_sixths_ns
 from echelon.sim.batch.pools import Pools, records_of
 from echelon.sim.batch.robots import motion_of
@@ -31,21 +37,23 @@ class ModelMaker:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.pools = Pools()
-        self._links = {(link.source, link.receiver, link.channel): at for at, link in enumerate(plan.links)}
-        self._streams: dict[tuple[int, Channel], int] = {}
+        self.of_links = LinkMaker(plan, self.pools)
+        self._shared: dict[str, int] = {}
         self.fractions = fractions(plan)
 
     def make(self) -> r.Model:
         """Returns the arrays."""
         plan, pools = self.plan, self.pools
-        streams = [self._stream(source, channel) for source, channel in self._sources()]
-        links = [
-            self._link(at, streams[self._streams[link.source, link.channel]]) for at, link in enumerate(plan.links)
-        ]
+        self.places = pools.real(2 * len(plan.formation))
+        streams, links = self.of_links.make()
         robots = [self._robot(robot) for robot in plan.robots]
-        nodes = [self._node(node) for node in plan.nodes]
+        nodes = [self._node(node) | self._passing() for node in plan.nodes]
         blocks = [self._block(block) for block in plan.blocks]
         run = self._run()
+        # What is seldom touched comes last: what is touched at each instant lies close together.
+        for link, record in zip(plan.links, links, strict=True):
+            record |= self.of_links.ages(link)
+        run["slots_at"] = pools.whole(r.SLOTS)
         table, index = pools.arrays()
         return r.Model(
             records_of(r.RUN, [run]),
@@ -58,120 +66,24 @@ class ModelMaker:
             index,
         )
 
-    def _sources(self) -> list[tuple[int, Channel]]:
-        """Returns the streams: every source and channel that a link begins with, in the order of the links."""
-        sources = list(dict.fromkeys((link.source, link.channel) for link in self.plan.links))
-        self._streams = {source: at for at, source in enumerate(sources)}
-        return sources
-
-    def _depth(self, source: int, channel: Channel) -> int:
-        """Returns how many messages of a stream are kept: a power of two, above those in flight at any time."""
-        most = 1
-        for link in self.plan.links:
-            if (link.source, link.channel) == (source, channel) and not link.prompt:
-                # A message may be sent a period late, and is asked for a period of the receiver later.
-                asked_ns = self.plan.formation[link.receiver].period_ns
-                late_ns = min(link.delay_max_ns, self.plan.duration_ns) + asked_ns
-                most = max(most, late_ns // link.period_ns + 4)
-        return 1 << (most - 1).bit_length()
-
-    def _stream(self, source: int, channel: Channel) -> dict[str, Any]:
-        depth = self._depth(source, channel)
-        if channel is Channel.STATE:
-            length = self._state_length(source)
-        else:
-            length = next(
-                link.size or 0 for link in self.plan.links if (link.source, link.channel) == (source, channel)
-            )
-        return {
-            "length": length,
-            "mask": depth - 1,
-            "at": self.pools.real(depth * length),
-            "marks_at": self.pools.whole(1 + 2 * depth),
-        }
-
-    def _state_length(self, robot: int) -> int:
-        """Returns how many values of a robot's STATE are used: position and velocity, and its acceleration if a node moves late
-        states on with it."""
-        extrapolated = (link.policy == EXTRAPOLATE for link in self.plan.links if link.source == robot)
-        return 6 if any(extrapolated) else 4
-
-    def _link(self, at: int, stream: Mapping[str, Any]) -> dict[str, Any]:
-        plan, pools, link = self.plan, self.pools, self.plan.links[at]
-        parts = self._parts(at)
-        size = 0 if link.prompt else max(first + count for first, count in parts)
-        shift = parts[0][0] if len(parts) == 1 and size else 0  # of one part only that part is kept
-        record = {
-            "length": stream["length"],
-            "mask": stream["mask"],
-            "stream_at": stream["at"],
-            "stream_marks_at": stream["marks_at"],
-            "prompt": link.prompt,
-            "timeout_ns": link.timeout_ns,
-            "end_ns": plan.duration_ns,
-            "at": pools.real(size - shift) - shift,
-            "brought": self._brought(link),
-            "odd_clocks": not link.clocks_are_true,
-            "of_robot": link.channel is Channel.STATE,
-            "zeros_at": pools.real(stream["length"]) if link.policy == "zero" else -1,
-            "marks_at": pools.whole(r.LINK_WHOLES + (0 if link.prompt else 2 * stream["mask"] + 2)),
-        } | fates_of(link, pools)
-        record |= self._ages(link)
-        for number, (first, count) in enumerate(parts, start=1):
-            record |= {f"first_{number}": first, f"size_{number}": count}
-        return record
-
-    def _brought(self, link: LinkPlan) -> int:
-        """Returns how late states of a link are brought to the present."""
-        if link.channel not in (Channel.STATE, Channel.GROUP_STATE):
-            return r.AS_THEY_ARE
-        otherwise = r.WITH_REFERENCE if self.plan.reference == "message" else r.AS_THEY_ARE
-        return {EXTRAPOLATE: r.EXTRAPOLATED, PREDICT: r.PREDICTED}.get(link.policy, otherwise)
-
-    def _ages(self, link: LinkPlan) -> dict[str, int]:
-        """Returns where the ages of a link's messages are counted."""
-        pools, duration_ns, receiver = self.pools, self.plan.duration_ns, self.plan.formation[link.receiver]
-        acts_late = receiver.event_driven and not all(each.prompt for each in self.plan.links_into(link.receiver))
-        # A message is used once in each period of the receiver, and when it arrives or becomes too old.
-        most = duration_ns // receiver.period_ns + 3 * (duration_ns // link.period_ns) + 4
-        if link.prompt and not acts_late and receiver.period_ns % link.period_ns == 0:
-            most = 0  # it is always new
-        many = most > EXACT
-        return {
-            "ages_at": pools.whole(min(most, r.LISTED)),
-            "uses_at": pools.whole(EXACT if many else 0),
-            "bins_at": pools.whole(duration_ns.bit_length() << 7 if many else 0),
-        }
-
-    def _parts(self, at: int) -> list[tuple[int, int]]:
-        """Returns what a receiver uses of the messages of a link: places and lengths."""
-        link, plan = self.plan.links[at], self.plan
-        receiver = plan.formation[link.receiver]
-        if link.channel is Channel.STATE:
-            return [(0, self._state_length(link.source))]
-        if link.channel is Channel.GROUP_STATE:
-            return [(0, link.size or 0)]
-        slices = [acceleration_of(receiver)]
-        if link.channel is Channel.REFERENCE and isinstance(receiver, NodePlan):
-            mine = NodeLayout.of(plan, receiver).mine
-            assert mine is not None
-            slices += [part for part in (mine.rates, mine.forces) if length(part)]
-        return [(part.start, length(part)) for part in slices]
-
     def _robot(self, robot: RobotPlan) -> dict[str, Any]:
         return motion_of(robot) | {
             "on_arrival": robot.event_driven and not all(link.prompt for link in self.plan.links_into(robot.index)),
             "at": self.pools.real(r.ROBOT_REALS),
-            "stream": self._streams[robot.index, Channel.STATE],
-            "link": self._links[robot.parent, robot.index, Channel.COMMAND],
+            "place": self.places + 2 * robot.index,
+            "stream": self.of_links.streams[robot.index, Channel.STATE],
+            "link": self.of_links.numbers[robot.parent, robot.index, Channel.COMMAND],
             "command": 2 * robot.child_number,
+            "says_acceleration": self.of_links.state_length(robot.index) > 4,
         }
 
     def _node(self, node: NodePlan) -> dict[str, Any]:
         plan, pools, layout = self.plan, self.pools, NodeLayout.of(self.plan, node)
         count, state, mine = len(node.children), layout.state, layout.mine
         kinds = [Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE for child in node.children]
-        links = [self._links[child, node.index, kind] for child, kind in zip(node.children, kinds, strict=True)]
+        links = [
+            self.of_links.numbers[child, node.index, kind] for child, kind in zip(node.children, kinds, strict=True)
+        ]
         parent = None if node.parent is None else plan.formation[node.parent]
         coupled = length(state.rates) > 0
         return {
@@ -189,22 +101,17 @@ class ModelMaker:
             "bounds_at": pools.index(list(accumulate(node.weights, initial=0))),
             "child_of_at": pools.index([child for child, weight in enumerate(node.weights) for _ in range(weight)]),
             "carried_at": self._carried(layout, count),
-            "up": self._streams.get((node.index, Channel.GROUP_STATE), -1),
-            "reference": self._streams.get((node.index, Channel.REFERENCE), -1),
-            "command": self._streams.get((node.index, Channel.COMMAND), -1),
-            "link": -1 if node.parent is None else self._links[node.parent, node.index, Channel.REFERENCE],
+            "up": self.of_links.streams.get((node.index, Channel.GROUP_STATE), -1),
+            "reference": self.of_links.streams.get((node.index, Channel.REFERENCE), -1),
+            "command": self.of_links.streams.get((node.index, Channel.COMMAND), -1),
+            "link": -1 if node.parent is None else self.of_links.numbers[node.parent, node.index, Channel.REFERENCE],
             "acceleration": 0 if mine is None else mine.acceleration.start,
             "parent_rates": 0 if mine is None else mine.rates.start,
             "parent_forces": 0 if mine is None else mine.forces.start,
             "block": next(at for at, block in enumerate(plan.blocks) if block.node == node.index),
             "desired_at": pools.table(desired_shape(node.shape, node.weights)),
-            "s_at": pools.real(4 * count),
             "e_at": pools.real(4 * count),
             "c_at": pools.real(2),
-            "eta_at": pools.real(2 * count),
-            "a_at": pools.real(2 * count),
-            "f_pot_at": pools.real(2 * count),
-            "forces_at": pools.real(2 * node.robots if plan.avoidance.enabled else 0),
             "order_at": pools.whole(node.robots + 1 if plan.avoidance.enabled else 0),
             "state_at": pools.real(state.size),
             "has_state_at": pools.whole(1),
@@ -215,6 +122,19 @@ class ModelMaker:
             "rates_size": 2 * len(plan.robots) if plan.coupled else 0,
             "positions": state.positions.start,
         } | self._commands(node, [plan.links[link] for link in links])
+
+    def _passing(self) -> dict[str, int]:
+        """Returns scratch that nodes need only while they act: all have the same."""
+        if not self._shared:
+            count, pools = max(len(node.children) for node in self.plan.nodes), self.pools
+            self._shared = {
+                "s_at": pools.real(4 * count),
+                "eta_at": pools.real(2 * count),
+                "a_at": pools.real(2 * count),
+                "f_pot_at": pools.real(2 * count),
+                "forces_at": pools.real(2 * len(self.plan.robots) if self.plan.avoidance.enabled else 0),
+            }
+        return self._shared
 
     def _commands(self, node: NodePlan, links: Sequence[LinkPlan]) -> dict[str, int]:
         """Returns where a node keeps its commands: those that may act later than a message was sent that comes into use."""
@@ -306,13 +226,12 @@ class ModelMaker:
             "fractions_at": pools.table(self.fractions),
             "fractions": len(self.fractions),
             "due_at": pools.whole(len(plan.formation)),
-            "places_at": pools.real(2 * len(plan.formation)),
+            "places_at": self.places,
             "rates_at": pools.real(2 * len(plan.formation)),
             "before_at": pools.real(2 * len(plan.robots)),
             "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),
             "closest_at": pools.whole(4),
-            "slots_at": pools.whole(r.SLOTS),
             "avoidance_radius": avoidance.avoidance_radius,
             "sensing_radius": avoidance.sensing_radius,
             "force_limit": avoidance.force_limit,

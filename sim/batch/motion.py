@@ -20,8 +20,6 @@ from echelon.sim.batch.records import (
     TAU_RIGHT,
     THETA,
     V,
-    X,
-    Y,
 )
 
 _INNER: Final = (1 - sqrt(1 / 5)) / 2
@@ -29,6 +27,8 @@ _INNER: Final = (1 - sqrt(1 / 5)) / 2
 _ENDS: Final = 1 / 12
 _MIDDLE: Final = 5 / 12
 """Its weights"""
+State = tuple[float, float, float, float, float, float, float]
+"""x, y, θ, v, ω, cos θ and sin θ"""
 
 
 @fused
@@ -53,19 +53,29 @@ def move(robot: Any, real: Any, now_ns: int, until_ns: int, ax: float, ay: float
 def _pass(robot: Any, real: Any, count: int, ax: float, ay: float, commanded: bool) -> None:
     """Runs torque loop and plant through whole torque periods."""
     at, h = robot.at, robot.h
+    x, y, theta, v, omega, c, s = _state(real, at, robot.place)
+    last_right, last_left = real[at + TAU_RIGHT], real[at + TAU_LEFT]
+    held_s = real[at + HELD_S] if robot.on_arrival else h
     right_square, left_square, peak = real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK]
+    saturated = real[at + P_SATURATED]
     for _ in range(count):
         right = left = 0.0
         if commanded:
-            right, left = inverse(robot, real, ax, ay, 0.5 * h)
+            right, left = inverse(robot, theta, v, omega, c, s, ax, ay, 0.5 * h)
         if robot.limited:
-            right, left, acted = limits(robot, real, right, left)
-            real[at + P_SATURATED] += acted
-            real[at + HELD_S] = h
-        _step(robot, real, right, left, h)
+            right, left, acted = limits(robot, v, omega, last_right, last_left, held_s, right, left)
+            last_right, last_left, held_s = right, left, h
+            saturated += acted
+        x, y, theta, v, omega, c, s = _step(robot, x, y, theta, v, omega, c, s, right, left, h)
         right_square += right * right
         left_square += left * left
         peak = max(peak, abs(right), abs(left))
+    _keep(real, at, robot.place, x, y, theta, v, omega, c, s)
+    if robot.limited:
+        real[at + TAU_RIGHT], real[at + TAU_LEFT] = last_right, last_left
+        real[at + P_SATURATED] = saturated
+        if robot.on_arrival:
+            real[at + HELD_S] = h
     real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK] = right_square, left_square, peak
 
 
@@ -76,18 +86,22 @@ def _pass_part(
     """Runs torque loop and plant through `span` [s] of a torque period of which `left_s` [s] are left; `first`: it begins
     now."""
     at = robot.at
+    x, y, theta, v, omega, c, s = _state(real, at, robot.place)
     right = left = 0.0
     if commanded:
-        right, left = inverse(robot, real, ax, ay, 0.5 * left_s)
+        right, left = inverse(robot, theta, v, omega, c, s, ax, ay, 0.5 * left_s)
     if first:
         real[at + P_PART] = 0.0
     if robot.limited:
-        right, left, acted = limits(robot, real, right, left)
+        last_right, last_left, held_s = real[at + TAU_RIGHT], real[at + TAU_LEFT], real[at + HELD_S]
+        right, left, acted = limits(robot, v, omega, last_right, last_left, held_s, right, left)
+        real[at + TAU_RIGHT], real[at + TAU_LEFT] = right, left
         if acted > real[at + P_PART]:
             real[at + P_SATURATED] += 1.0
             real[at + P_PART] = 1.0
     real[at + HELD_S] = span
-    _step(robot, real, right, left, span)
+    x, y, theta, v, omega, c, s = _step(robot, x, y, theta, v, omega, c, s, right, left, span)
+    _keep(real, at, robot.place, x, y, theta, v, omega, c, s)
     share = span / robot.h
     real[at + P_RIGHT] += share * right * right
     real[at + P_LEFT] += share * left * left
@@ -95,21 +109,51 @@ def _pass_part(
 
 
 @fused
-def _step(robot: Any, real: Any, right: float, left: float, span: float) -> None:
-    """Moves a robot with torques through `span` [s]."""
-    if robot.plant == PAPER:
-        paper_step(robot, real, right, left, span)
-    else:
-        body_step(robot, real, right, left, span)
+def _state(real: Any, at: int, place: int) -> State:
+    """Returns x, y, θ, v, ω, cos θ and sin θ of a robot.  They are read at once, and written at once (`_keep`): between, they
+    need no memory."""
+    return (
+        real[place],
+        real[place + 1],
+        real[at + THETA],
+        real[at + V],
+        real[at + OMEGA],
+        real[at + COS],
+        real[at + SIN],
+    )
 
 
 @fused
-def limits(robot: Any, real: Any, right: float, left: float) -> tuple[float, float, float]:
-    """Returns the limited torques, and 1 if one was limited, else 0; keeps them for the next call."""
-    at = robot.at
-    v, turning = real[at + V], robot.arm * real[at + OMEGA]
-    last_right, last_left = real[at + TAU_RIGHT], real[at + TAU_LEFT]
-    most, change = robot.torque_limit, robot.torque_rate_limit * real[at + HELD_S]
+def _keep(
+    real: Any, at: int, place: int, x: float, y: float, theta: float, v: float, omega: float, c: float, s: float
+) -> None:
+    """Writes the state of a robot."""
+    real[place], real[place + 1] = x, y
+    real[at + THETA] = theta
+    real[at + V] = v
+    real[at + OMEGA] = omega
+    real[at + COS] = c
+    real[at + SIN] = s
+
+
+@fused
+def _step(
+    robot: Any, x: float, y: float, theta: float, v: float, omega: float, c: float, s: float,
+    right: float, left: float, span: float,
+) -> State:  # fmt: skip
+    """Moves a robot with torques through `span` [s]; returns its state then."""
+    if robot.plant == PAPER:
+        return paper_step(robot, x, y, theta, v, omega, c, s, right, left, span)
+    return body_step(robot, x, y, theta, v, omega, c, s, right, left, span)
+
+
+@fused
+def limits(
+    robot: Any, v: float, omega: float, last_right: float, last_left: float, held_s: float, right: float, left: float
+) -> tuple[float, float, float]:
+    """Returns the limited torques, and 1 if one was limited, else 0.  The torques before were held for `held_s` [s]."""
+    turning = robot.arm * omega
+    most, change = robot.torque_limit, robot.torque_rate_limit * held_s
     acted = 0.0
     if not (
         abs(right) <= most
@@ -123,16 +167,14 @@ def limits(robot: Any, real: Any, right: float, left: float) -> tuple[float, flo
         left = _limited(robot, left, last_left, change, v - turning)
         if right != wanted_right or left != wanted_left:
             acted = 1.0
-    real[at + TAU_RIGHT] = right
-    real[at + TAU_LEFT] = left
     return right, left, acted
 
 
 @fused
-def inverse(robot: Any, real: Any, ax: float, ay: float, lead: float) -> tuple[float, float]:
+def inverse(
+    robot: Any, theta: float, v: float, omega: float, c: float, s: float, ax: float, ay: float, lead: float
+) -> tuple[float, float]:
     """Returns the wheel torques for a wanted acceleration, for the state after `lead` [s]."""
-    at = robot.at
-    theta, v, omega, c, s = real[at + THETA], real[at + V], real[at + OMEGA], real[at + COS], real[at + SIN]
     d = robot.offset
     v_dot = c * ax + s * ay + d * omega * omega
     omega_dot = (c * ay - s * ax - v * omega) * robot.per_offset
@@ -158,16 +200,18 @@ def _limited(robot: Any, wanted: float, last: float, change: float, speed: float
 
 
 @fused
-def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float) -> None:
-    """Moves a robot of the paper's plant through h [s]."""
-    at, d = robot.at, robot.offset
-    theta, v, omega, c_0, s_0 = real[at + THETA], real[at + V], real[at + OMEGA], real[at + COS], real[at + SIN]
+def paper_step(
+    robot: Any, x: float, y: float, theta: float, v: float, omega: float, c_0: float, s_0: float,
+    tau_right: float, tau_left: float, h: float,
+) -> State:  # fmt: skip
+    """Moves a robot of the paper's plant through h [s]; returns its state then."""
+    d = robot.offset
     v_dot = (tau_right + tau_left) * robot.per_sum
     omega_dot = (tau_right - tau_left) * robot.per_difference
     half = 0.5 * omega_dot
     theta_1, v_1 = theta + h * (omega + half * h), v + v_dot * h
     c_1, s_1 = cos_sin(theta_1)
-    x, y = real[at + X] + d * (c_1 - c_0), real[at + Y] + d * (s_1 - s_0)
+    x, y = x + d * (c_1 - c_0), y + d * (s_1 - s_0)
     turn = h * (abs(omega) + abs(omega_dot) * h)
     if turn <= 0.5:
         t_1, t_2 = _INNER * h, (1 - _INNER) * h
@@ -180,7 +224,7 @@ def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: floa
     else:
         panels = 1
         if isfinite(turn):
-            panels = 16 if turn >= 8.0 else ceil(2 * turn)
+            panels = 16 if turn >= 8.0 else int(ceil(2 * turn))  # noqa: RUF046
         width = h / panels
         ends, inner = width * _ENDS, width * _MIDDLE
         for panel in range(panels):
@@ -192,28 +236,22 @@ def paper_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: floa
                 c, s = cos_sin(theta + t * (omega + half * t))
                 x += along * c
                 y += along * s
-    real[at + X] = x
-    real[at + Y] = y
-    real[at + THETA] = theta_1
-    real[at + V] = v_1
-    real[at + OMEGA] = omega + omega_dot * h
-    real[at + COS] = c_1
-    real[at + SIN] = s_1
+    return x, y, theta_1, v_1, omega + omega_dot * h, c_1, s_1
 
 
 @fused
-def body_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float) -> None:
-    """Moves a rigid body, on a hill or not, through h [s]."""
-    at = robot.at
+def body_step(
+    robot: Any, x: float, y: float, theta: float, v: float, omega: float, c: float, s: float,
+    tau_right: float, tau_left: float, h: float,
+) -> State:  # fmt: skip
+    """Moves a rigid body, on a hill or not, through h [s]; returns its state then."""
     push = (tau_right + tau_left) * robot.per_sum
     turn = (tau_right - tau_left) * robot.per_difference
-    x, y, theta, v, omega = real[at + X], real[at + Y], real[at + THETA], real[at + V], real[at + OMEGA]
     pace = h * (abs(omega) + robot.lever * abs(v) + sqrt(abs(turn)) + sqrt(robot.lever * abs(push)) + robot.always)
     count = 1
     if isfinite(pace):
-        count = 500 if pace >= 10.0 else max(1, ceil(pace / 0.02))
+        count = 500 if pace >= 10.0 else max(1, int(ceil(pace / 0.02)))  # noqa: RUF046
     k = h / count
-    c, s = real[at + COS], real[at + SIN]
     for _ in range(count):
         a_x, a_y, a_v, a_w = _rates(robot, c, s, v, omega, push, turn)
         o_b = omega + 0.5 * k * a_w
@@ -232,12 +270,7 @@ def body_step(robot: Any, real: Any, tau_right: float, tau_left: float, h: float
         v += sixth * (a_v + 2 * (b_v + c_v) + e_v)
         omega += sixth * (a_w + 2 * (b_w + c_w) + e_w)
         c, s = cos_sin(theta)
-    real[at + X] = x
-    real[at + Y] = y
-    real[at + THETA] = theta
-    real[at + V] = v
-    real[at + OMEGA] = omega
-    real[at + COS], real[at + SIN] = c, s
+    return x, y, theta, v, omega, c, s
 
 
 @fused

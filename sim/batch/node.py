@@ -5,6 +5,7 @@ from typing import Any
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.late_states import bring, note_commands
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
+from echelon.sim.batch.memory import copy, copy_four
 from echelon.sim.batch.potential import add_pair_forces
 from echelon.sim.batch.records import STAMP, WITH_REFERENCE
 from echelon.sim.batch.streams import hear, heard_ns, read_age_ns, room, say, take_up
@@ -35,12 +36,10 @@ def gather(
         if said < 0:
             complete = 0
             continue
-        for value in range(4):
-            real[node.s_at + 4 * child + value] = real[said + value]
+        copy_four(real, said, node.s_at + 4 * child)
         for part in range(index[node.carried_at + child], index[node.carried_at + child + 1]):
             there, here, size = index[3 * part], index[3 * part + 1], index[3 * part + 2]
-            for value in range(size):
-                real[node.state_at + here + value] = real[said + there + value]
+            copy(real, said + there, node.state_at + here, size)
         if link.brought:
             since_ns = whole[link.marks_at + STAMP]
             if link.odd_clocks:
@@ -56,9 +55,7 @@ def gather(
     if speaks:
         up = streams[node.up]
         if complete:
-            place = room(up, whole)
-            for value in range(up.length):
-                real[place + value] = real[node.state_at + value]
+            copy(real, node.state_at, room(up, whole), up.length)
         say(up, whole, time_ns, 1 - complete)
 
 
@@ -76,11 +73,11 @@ def _transform(node: Any, run: Any, table: Any, real: Any, time_ns: int) -> None
     to_shape(node, 4, table, real, node.s_at, e)
     to_shape(node, 4, table, real, node.s_at + 2, e + 2)
     centroid = e + 4 * (count - 1)
-    for value in range(4):
-        real[state + value] = real[centroid + value]
+    copy_four(real, centroid, state)
     for variable in range(count - 1):
-        real[e + 4 * variable] -= table[node.desired_at + 2 * variable]
-        real[e + 4 * variable + 1] -= table[node.desired_at + 2 * variable + 1]
+        e_x, e_y = real[e + 4 * variable], real[e + 4 * variable + 1]
+        real[e + 4 * variable] = e_x - table[node.desired_at + 2 * variable]
+        real[e + 4 * variable + 1] = e_y - table[node.desired_at + 2 * variable + 1]
     if node.own_rates >= 0:
         for variable in range(count - 1):
             real[state + node.own_rates + 2 * variable] = real[e + 4 * variable + 2]
@@ -119,8 +116,8 @@ def steer(
         if said < 0:
             complete = 0
         else:
-            real[node.c_at] = real[said + node.acceleration]
-            real[node.c_at + 1] = real[said + node.acceleration + 1]
+            a = said + node.acceleration
+            real[node.c_at], real[node.c_at + 1] = real[a], real[a + 1]
             rates, forces = said + node.parent_rates, said + node.parent_forces
     else:
         rates = node.state_at + node.rates
@@ -143,30 +140,28 @@ def steer(
         note_commands(node, real, whole, time_ns, True)
     if node.command >= 0:
         command = streams[node.command]
-        place = room(command, whole)
-        for value in range(2 * node.count):
-            real[place + value] = real[node.a_at + value]
+        copy(real, node.a_at, room(command, whole), 2 * node.count)
         say(command, whole, time_ns, 0)
     if node.reference >= 0:
         reference = streams[node.reference]
         place = room(reference, whole)
-        for value in range(2 * node.count):
-            real[place + value] = real[node.a_at + value]
+        copy(real, node.a_at, place, 2 * node.count)
         place += 2 * node.count
-        for value in range(node.rates_size):
-            real[place + value] = real[rates + value]
+        copy(real, rates, place, node.rates_size)
         place += node.rates_size
         if run.avoidance:
-            for value in range(2 * node.robots):
-                real[place + value] = real[node.forces_at + value]
+            copy(real, node.forces_at, place, 2 * node.robots)
         say(reference, whole, time_ns, 0)
 
 
 @fused
 def _add_forces(node: Any, run: Any, table: Any, index: Any, real: Any, whole: Any, parent_forces: int) -> None:
     """Computes the forces on the robots below, those from above included, and F_pot of the node's blocks."""
-    for value in range(2 * node.robots):
-        real[node.forces_at + value] = real[parent_forces + value] if parent_forces >= 0 else 0.0
+    if parent_forces >= 0:
+        copy(real, parent_forces, node.forces_at, 2 * node.robots)
+    else:
+        for value in range(2 * node.robots):
+            real[node.forces_at + value] = 0.0
     add_pair_forces(node, run, index, real, whole)
     robot = node.forces_at
     for child in range(node.count):
@@ -191,10 +186,9 @@ def _accelerate(node: Any, run: Any, blocks: Any, table: Any, index: Any, real: 
     if node.link < 0:
         if f_pot >= 0:
             f_pot += shape
-        own_law(run, blocks[-1], table, index, real, node.e_at + 2 * shape, rates, f_pot, centroid)
+        own_law(run, blocks[len(blocks) - 1], table, index, real, node.e_at + 2 * shape, rates, f_pot, centroid)
         real[centroid] += real[node.c_at]
         real[centroid + 1] += real[node.c_at + 1]
     else:
-        real[centroid] = real[node.c_at]
-        real[centroid + 1] = real[node.c_at + 1]
+        real[centroid], real[centroid + 1] = real[node.c_at], real[node.c_at + 1]
     to_children(node, table, real, node.eta_at, node.a_at)

@@ -18,7 +18,8 @@ def sort_along(count: int, positions: int, order: int, real: Any, whole: Any) ->
     """Sorts the numbers of `count` robots, from `order` on in `whole`, along the axis on which they are spread; returns the
     axis, 0 or 1.  The axis, which follows the numbers, changes only if the spread along the other is twice as large.
 
-    A few robots stay as they are: to look at all their pairs costs less.  Then it returns -1."""
+    A few robots stay as they are: to look at all their pairs costs less.  Then it returns -1, and their order need not be
+    read: it is 0 to `count` - 1."""
     if count <= _FEW:
         return -1
     low_x = high_x = real[positions]
@@ -51,12 +52,12 @@ def add_pair_forces(node: Any, run: Any, index: Any, real: Any, whole: Any) -> N
     reach = run.sensing_radius
     axis = sort_along(node.robots, positions, order, real, whole)
     for place in range(node.robots - 1):
-        one = whole[order + place]
+        one = place if axis < 0 else whole[order + place]
         x, y = real[positions + 2 * one], real[positions + 2 * one + 1]
         last = x + reach if axis == 0 else y + reach
         child = index[node.child_of_at + one]
         for later in range(place + 1, node.robots):
-            other = whole[order + later]
+            other = later if axis < 0 else whole[order + later]
             if axis >= 0 and real[positions + 2 * other + axis] > last:
                 break
             dx, dy = x - real[positions + 2 * other], y - real[positions + 2 * other + 1]

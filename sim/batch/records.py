@@ -17,7 +17,8 @@ _INT: Final = "i8"
 
 
 def _record(wholes: str, reals: str) -> np.dtype[np.void]:
-    return np.dtype([(name, _INT) for name in wholes.split()] + [(name, _FLOAT) for name in reals.split()])
+    names = [(name, _INT) for name in wholes.split()] + [(name, _FLOAT) for name in reals.split()]
+    return np.dtype(names, align=True)  # what is not said to be aligned is read byte by byte on a GPU
 
 
 RUN: Final = _record(
@@ -33,8 +34,9 @@ RUN: Final = _record(
     "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead",
 )
 ROBOT: Final = _record(
-    # `at`: its state in `real`; `command`: place of its acceleration in its leader's COMMAND
-    "period_ns torque_period_ns torque_periods plant limited on_arrival at stream link command",
+    # `at`: its state in `real`, `place`: its position; `command`: place of its acceleration in its leader's COMMAND; whether
+    # its STATE has its own
+    "period_ns torque_period_ns torque_periods plant limited on_arrival at place stream link command says_acceleration",
     # plant and inverse (agents.plant, agents.torque); lever to always: of the rigid body
     "h per_sum per_difference offset half_sum half_difference lever pull_x pull_y drag turn_drag always "
     "per_offset torque_limit torque_rate_limit speed_limit arm x y heading",
@@ -98,17 +100,17 @@ AS_THEY_ARE, WITH_REFERENCE, EXTRAPOLATED, PREDICTED = 0, 1, 2, 3
 COMMAND_REALS: Final = 6
 """Of one child: acceleration, and velocity and displacement since run time 0 due to earlier commands"""
 
-# Places in a robot's part of `real`.
-X, Y, THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT, HELD_S = range(10)
+# Places in a robot's part of `real`.  Its position is among those of all robots.
+THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT, HELD_S = range(8)
 """... torques last held, and how long they were held [s]"""
-P_RIGHT, P_LEFT, P_PEAK, P_SATURATED, P_PART = range(10, 15)
+P_RIGHT, P_LEFT, P_PEAK, P_SATURATED, P_PART = range(8, 13)
 """Of the period so far, in torque periods: sums of the torques' squares, largest torque, torque periods in which a limit acted;
 whether one acted in an earlier part of the present torque period"""
-S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(15, 21)
+S_RIGHT, S_LEFT, S_PEAK, S_SATURATED, S_LATE, S_PERIODS = range(13, 19)
 """The same of all periods so far, squares as means; those after the first second; number of periods"""
-A_X, A_Y = 21, 22
+A_X, A_Y = 19, 20
 """The acceleration that it follows [m/s²]"""
-ROBOT_REALS: Final = 23
+ROBOT_REALS: Final = 21
 
 DRAWN, TABLE, TABLE_Z, BY_NUMBER, BY_TIME = range(5)
 """`LINK.kind`: uniform, a table of independent or of correlated delays, a trace"""

@@ -29,6 +29,16 @@ def refusal(plan: Plan) -> str | None:
     return next((f"{why}; use --engine inprocess" for why in _reasons(plan)), None)
 
 
+def gpu_refusal() -> str | None:
+    """Returns why this engine finds no GPU here, and what does the same; None if it finds one."""
+    try:
+        from echelon.sim.batch.gpu import why_not
+    except ImportError:
+        return "engine gpu needs numba-cuda: pip install 'echelon[gpu]'; --engine batch makes the same runs on the processor"
+    why = why_not()
+    return why and f"engine gpu: {why}; --engine batch makes the same runs on the processor"
+
+
 def _reasons(plan: Plan) -> Iterator[str]:
     if plan.can.closed:
         yield "can.path = 'closed': the batch engine has no bus and no drives"

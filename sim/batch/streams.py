@@ -6,6 +6,7 @@ from typing import Any
 from echelon.sim.batch.ages import note_age
 from echelon.sim.batch.compiled import compiled
 from echelon.sim.batch.fates import fates, rounded
+from echelon.sim.batch.memory import copy
 from echelon.sim.batch.records import (
     AGE_MAX,
     AGE_SUM,
@@ -50,33 +51,38 @@ def hear(link: Any, run: Any, index: Any, real: Any, whole: Any, time_ns: int) -
     """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
     use.  Must be called with ascending instants."""
     marks = link.marks_at
+    used = whole[marks + USED]
     if link.prompt:
-        number = whole[link.stream_marks_at] - 1
-        whole[marks + TAKEN] = number + 1
-        mark = link.stream_marks_at + 1 + 2 * (number & link.mask)
+        number, last = whole[link.stream_marks_at] - 1, whole[marks + TAKEN] - 1
+        slot = 0
+        if link.mask:
+            slot = number & link.mask
+        mark = link.stream_marks_at + 1 + 2 * slot
         sent_ns, is_null = whole[mark], whole[mark + 1]
-        whole[marks + STAMP] = sent_ns
-        place = link.stream_at + (number & link.mask) * link.length
+        whole[marks + TAKEN] = number + 1
+        if link.brought:
+            whole[marks + STAMP] = sent_ns
+        place = link.stream_at + slot * link.length
     else:
         take_up(link, index, whole)
         receive(link, whole, time_ns)
         _use(link, real, whole)
-        number, place = whole[marks + IN_USE], link.at
+        number, place, last = whole[marks + IN_USE], link.at, whole[marks + LAST]
         sent_ns, is_null = whole[marks + STAMP], whole[marks + IS_NULL]
+        whole[marks + LAST] = number
     if number < 0 or is_null:
         return -1
     age = time_ns - sent_ns
     if link.timeout_ns < FAR and read_age_ns(link, time_ns, sent_ns) > link.timeout_ns:
         return int(link.zeros_at)
-    whole[marks + USED] += 1
+    whole[marks + USED] = used + 1
     if age != 0:
-        if number == whole[marks + LAST]:
+        if number == last:
             whole[marks + HELD] += 1
         whole[marks + AGE_SUM] += age
         if age > whole[marks + AGE_MAX]:
             whole[marks + AGE_MAX] = age
         note_age(link, run, whole, age)
-    whole[marks + LAST] = number
     return int(place)
 
 
@@ -164,9 +170,9 @@ def _use(link: Any, real: Any, whole: Any) -> None:
     whole[marks + IS_NULL] = whole[mark + 1]
     if whole[mark + 1] == 0:
         source = link.stream_at + (newest & link.mask) * link.length
-        _copy(real, source + link.first_1, link.at + link.first_1, link.size_1)
-        _copy(real, source + link.first_2, link.at + link.first_2, link.size_2)
-        _copy(real, source + link.first_3, link.at + link.first_3, link.size_3)
+        copy(real, source + link.first_1, link.at + link.first_1, link.size_1)
+        copy(real, source + link.first_2, link.at + link.first_2, link.size_2)
+        copy(real, source + link.first_3, link.at + link.first_3, link.size_3)
 
 
 @compiled
@@ -220,9 +226,3 @@ def _next_arrival_ns(link: Any, whole: Any) -> int:
         if arrival != GONE:
             found = min(found, arrival)
     return int(found)
-
-
-@compiled
-def _copy(real: Any, source: int, place: int, size: int) -> None:
-    for value in range(size):
-        real[place + value] = real[source + value]

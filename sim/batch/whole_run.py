@@ -24,7 +24,6 @@ from echelon.sim.batch.records import (
     NEXT,
     OMEGA,
     P_LEFT,
-    P_PART,
     P_PEAK,
     P_RIGHT,
     P_SATURATED,
@@ -37,8 +36,6 @@ from echelon.sim.batch.records import (
     SIN,
     THETA,
     V,
-    X,
-    Y,
 )
 from echelon.sim.batch.streams import change_ns, hear, room, say
 
@@ -74,8 +71,10 @@ def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any, sums: An
             measured_ns = time_ns
             if len(trace) > instant:
                 for number in range(len(robots)):
-                    for value in range(7):
-                        trace[instant, number, value] = real[robots[number].at + value]
+                    robot = robots[number]
+                    trace[instant, number, 0], trace[instant, number, 1] = real[robot.place], real[robot.place + 1]
+                    for value in range(5):
+                        trace[instant, number, 2 + value] = real[robot.at + value]
             if len(sums) > instant:
                 _add_squares(blocks, real, sums, instant)
             instant += 1
@@ -126,7 +125,8 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
         if said >= 0:
             ax, ay = real[said + robot.command], real[said + robot.command + 1]
         move(robot, real, now_ns, until_ns, ax, ay, said >= 0)
-        real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
+        if robot.says_acceleration:
+            real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
         now_ns = until_ns
 
 
@@ -138,8 +138,7 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
         whole[place] = 0
     for number in range(len(robots)):
         robot = robots[number]
-        real[robot.at + X] = robot.x
-        real[robot.at + Y] = robot.y
+        real[robot.place], real[robot.place + 1] = robot.x, robot.y
         real[robot.at + THETA] = robot.heading
         real[robot.at + HELD_S] = robot.h
         real[robot.at + COS] = cos(robot.heading)
@@ -168,30 +167,34 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
 @compiled
 def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> bool:
     """Sends a robot's state and adds up the torques of the period that ends; returns whether all of it is finite."""
-    at = robot.at
-    c, s, v, across = real[at + COS], real[at + SIN], real[at + V], robot.offset * real[at + OMEGA]
-    place = room(stream, whole)
-    real[place] = real[at + X]
-    real[place + 1] = real[at + Y]
-    real[place + 2] = v * c - across * s
-    real[place + 3] = v * s + across * c
-    if stream.length > 4:
+    at, place = robot.at, room(stream, whole)
+    x, y, theta, v, omega = real[robot.place], real[robot.place + 1], real[at + THETA], real[at + V], real[at + OMEGA]
+    c, s, across = real[at + COS], real[at + SIN], robot.offset * omega
+    right, left, peak, saturated = real[at + P_RIGHT], real[at + P_LEFT], real[at + P_PEAK], real[at + P_SATURATED]
+    all_right, all_left, highest, periods = (
+        real[at + S_RIGHT],
+        real[at + S_LEFT],
+        real[at + S_PEAK],
+        real[at + S_PERIODS],
+    )
+    vx, vy = v * c - across * s, v * s + across * c
+    real[place], real[place + 1], real[place + 2], real[place + 3] = x, y, vx, vy
+    if robot.says_acceleration:
         real[place + 4] = real[at + A_X]
         real[place + 5] = real[at + A_Y]
     say(stream, whole, time_ns, 0)
-    total = real[place] + real[place + 1] + real[place + 2] + real[place + 3] + real[at + THETA]
-    total += real[at + OMEGA] + real[at + P_RIGHT] + real[at + P_LEFT] + real[at + P_PEAK]
     if time_ns > 0:
-        real[at + S_RIGHT] += real[at + P_RIGHT] / robot.torque_periods
-        real[at + S_LEFT] += real[at + P_LEFT] / robot.torque_periods
-        real[at + S_PEAK] = max(real[at + S_PEAK], real[at + P_PEAK])
-        real[at + S_SATURATED] += real[at + P_SATURATED]
-        real[at + S_PERIODS] += 1.0
-        if time_ns > STARTED_NS:
-            real[at + S_LATE] += real[at + P_SATURATED]
-        for place in range(at + P_RIGHT, at + P_PART):
-            real[place] = 0.0
-    return isfinite(total)
+        real[at + S_RIGHT] = all_right + right / robot.torque_periods
+        real[at + S_LEFT] = all_left + left / robot.torque_periods
+        real[at + S_PEAK] = max(highest, peak)
+        real[at + S_PERIODS] = periods + 1.0
+        real[at + P_RIGHT] = real[at + P_LEFT] = real[at + P_PEAK] = 0.0
+        if saturated > 0.0:
+            real[at + P_SATURATED] = 0.0
+            real[at + S_SATURATED] += saturated
+            if time_ns > STARTED_NS:
+                real[at + S_LATE] += saturated
+    return isfinite(x + y + vx + vy + theta + omega + right + left + peak)
 
 
 @compiled

@@ -22,6 +22,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.session import Session, loopback_endpoints
 from echelon.sim.doctor.can_checks import check_fit, check_interfaces, check_multicast, check_tools, check_vcan
 from echelon.sim.doctor.diagnosis import LIMIT_S, Diagnosis
+from echelon.sim.wall_load import BUSY
 
 PACKAGES: Final = ("eclipse-zenoh", "python-can", "numpy", "scipy", "cantools", "mcap", "pydantic")
 """Packages whose versions are shown"""
@@ -36,8 +37,6 @@ BUFFER: Final = 4 << 20
 """The size of socket buffer that the bridge asks for, which holds a burst while it waits for a processor [bytes]"""
 SPACE: Final = 1 << 30
 """Recordings soon fill less free space than this [bytes]"""
-BUSY: Final = 0.6
-"""Estimated load above which a run on a wall clock misses deadlines, as a fraction of all processors"""
 HANDLING: Final = 2.0
 """Processor time that a message costs sender, receiver and recorder, as a multiple of its measured round trip.  Measured:
 paper.toml with recorder and CAN takes two processors 1.3 ms for a tick of 24 messages"""
@@ -219,7 +218,11 @@ def check_wall_clock(plan: Plan, measured: Measured, instants: int = 50) -> Diag
     said = f"period {period_s * 1e3:g} ms: {len(plan.all_roles)} processes take about {100 * share:.0f} % of {cores} processors"
     advice = []
     if share > BUSY:
-        advice.append("too much for real time: use longer periods, fewer robots, or --clock virtual")
+        fit = max(1, int(len(plan.robots) * BUSY / share))
+        advice.append(
+            f"too much for real time, about {fit} robots fit: use longer periods, fewer robots, or --clock virtual; "
+            "otherwise stages are late, and the recording is thinned"
+        )
     if measured.jitter_s > period_s / 2:
         advice.append(
             f"processes wake up to {measured.jitter_s * 1e3:.2g} ms late: use periods over {2e3 * measured.jitter_s:.2g} ms"

@@ -9,6 +9,7 @@ from math import gcd
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from echelon.agents.robot import make_robot
+from echelon.agents.torque_loop import Loop, usual
 from echelon.controller.node import TreeNode
 from echelon.messages import Heard, Message
 from echelon.plan.plan import NodePlan, Plan, RobotPlan
@@ -29,13 +30,13 @@ def make_roles(plan: Plan) -> list[Role]:
     return [make_role(plan, index) for index in range(len(plan.all_roles))]
 
 
-def make_role(plan: Plan, index: int) -> Role:
-    """Returns one role of a plan: a robot, a node, the bridge or the drives.
+def make_role(plan: Plan, index: int, loop: Loop = usual) -> Role:
+    """Returns one role of a plan: a robot, a node, the bridge or the drives.  `loop` is the usual torque loop of a robot.
 
     Raises IndexError if the plan has no role of that index."""
     one = plan.all_roles[index]
     if isinstance(one, RobotPlan):
-        return make_robot(plan, index)
+        return make_robot(plan, index, loop)
     if isinstance(one, NodePlan):
         return TreeNode(plan, index)
     from echelon.bridge.roles.commander import Commander  # slow imports, which only bridge and drives need

@@ -1,18 +1,16 @@
 """Everything that `echelon analyse` predicts about a plan, as one record (`sim.results.analysis`)."""
 
 from collections.abc import Callable, Iterable, Sequence
-from math import inf, isfinite
-from typing import Final
+from math import exp, inf
+from typing import Final, TypeVar
 
 from echelon.controller.prediction.analysis import analyse
 from echelon.controller.prediction.block_margin import delay_margin
-from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError, linear_gains
-from echelon.controller.prediction.largest_delay import LargestDelay, largest_extra_delay
-from echelon.controller.prediction.linear_run import Edges, edge_of
-from echelon.controller.prediction.link_sets import LinkSet, link_sets
+from echelon.controller.prediction.largest_delay import largest_extra_delay
+from echelon.controller.prediction.linear_run import CHANNELS, ruled_links
+from echelon.controller.prediction.link_sets import link_sets
 from echelon.controller.prediction.lyapunov import lyapunov_bounds
-from echelon.controller.prediction.mean_square import mean_square
 from echelon.controller.prediction.modes import block_modes
 from echelon.controller.prediction.sampled_limits import coupling_limit, epsilon_range
 from echelon.controller.prediction.time_scales import (
@@ -22,75 +20,103 @@ from echelon.controller.prediction.time_scales import (
     largest_epsilon,
     with_epsilon,
 )
+from echelon.plan.link_plan import LinkPlan
 from echelon.plan.plan import Plan
-from echelon.sim.forecast.motion import asked_of
+from echelon.sim.forecast.estimating import RUNS, Estimates, is_random
+from echelon.sim.forecast.link_rows import LinkRows, Say, finite, links_result
+from echelon.sim.forecast.motion import Asked
+from echelon.sim.forecast.own_links import OwnLinks, calm
 from echelon.sim.forecast.settling import predicted_settling
 from echelon.sim.forecast.torque_loop import torque_loops
 from echelon.sim.results.analysis import (
     AnalysisResult,
+    CostResult,
     CouplingResult,
-    DelayResult,
     EpsilonResult,
-    LinksResult,
-    LossResult,
     ModesResult,
-    ScaledDelays,
     SettlingResult,
     TorqueLoopResult,
 )
+from echelon.sim.results.links_analysis import (
+    PolicyResult,
+    ScaledDelays,
+)
 
-MOST: Final = 30
-"""Largest number of robots for which losses and costs are computed"""
-LARGEST: Final = 250
-"""Most numbers that may act on each other where losses are computed: a few seconds for each set of links"""
-OF_MEMBERS: Final = ("group", "robot")
-Say = Callable[[str, int, int], None]
-"""What is being computed, how many parts are done, and how many there are"""
+Made = TypeVar("Made")
+Value = TypeVar("Value", float, str)
 
 
 def analysis_of(
     plan: Plan,
     time_scales: str,
     epsilon: Sequence[float],
+    asked: Asked,
     *,
     members: bool = False,
+    policies: bool = False,
+    runs: int = RUNS,
     say: Say = lambda what, done, of: None,
 ) -> AnalysisResult:
-    """Returns all predictions about a plan; `time_scales` and `epsilon` are those of its law.
+    """Returns all predictions about a plan; `time_scales` and `epsilon` are those of its law, `asked` is what it asks of its
+    robots.
 
-    `members`: also for each robot and each group.  `say` gets the progress.
+    `members`: also for each robot and each group.  `policies`: also what each policy buys.  `runs` is the number of runs where
+    something is estimated.  `say` gets the progress.
 
-    Raises PredictionError if no exact prediction is possible (`controller.prediction.analysis.analyse`)."""
+    Raises PredictionError if the law is not linear, or if nothing can be said about the links as they are."""
     say("stability", 0, 1)
-    found = analyse(plan)
-    asked = asked_of(plan)
+    for block in plan.blocks:
+        linear_gains(plan, block)
+    estimates = Estimates(plan, runs, lambda text: say(text, 0, 1))
+    own = OwnLinks(plan, estimates)
+    verdict = own.verdict()
+    still, left_out = calm(plan)
+    skipped: list[str] = []
+    found = own.exact or _or_none(lambda: analyse(still), "what follows from the linear run", skipped)
     loops = tuple(
         TorqueLoopResult(
-            loop.robot, _finite(loop.speed), loop.period, _finite(loop.factor), loop.longest_period, loop.is_stable
+            loop.robot, finite(loop.speed), loop.period, finite(loop.factor), loop.longest_period, loop.is_stable
         )
         for loop in torque_loops(plan, asked.speeds.tolist())
     )
-    skipped: list[str] = []
-    table = tuple(_table(plan, members, say)) if found.settles else ()
+    holds = found is not None and found.settles
+    say("expected cost", 0, 1)
+    cost = own.cost()
+    rows = LinkRows(plan, still, estimates, say)
+    table = tuple(rows.table(members)) if found is not None and verdict.settles else ()
+    channels = {one.channel: one.delay.seconds for one in table if one.kind == "channel"}
+    effects: tuple[PolicyResult, ...] = ()
+    if table and policies:
+        effects = own.effects(lambda channel: channels.get(channel.name.lower()), lambda what: say(what, 0, 1))
     say("ε and couplings", 0, 1)
-    blocks = tuple(_modes(plan))
+    blocks = tuple(_modes(still, cost)) if found is not None else ()
     is_stable_alone = all(one.poles[0][0] < 0 for one in blocks)
-    epsilons, coupling = _time_scales(plan, time_scales, epsilon, is_stable_alone, found.settles, skipped)
+    epsilons, coupling = _time_scales(still, time_scales, epsilon, is_stable_alone, holds, skipped)
+    exact = verdict.method == "exact"
+    H_s = plan.root.period_ns / 1e9
     return AnalysisResult(
         scenario=plan.name,
         assumptions=_assumptions(plan),
-        acceleration_periods=found.acceleration_periods,
-        torque_periods=found.torque_periods,
-        delays={channel.name.lower(): delays for channel, delays in found.delays.items()},
-        settles=found.settles,
+        acceleration_periods=_each_once(node.period_ns for node in plan.nodes),
+        torque_periods=_each_once(robot.torque_period_ns for robot in plan.robots),
+        delays=_of_channels(plan, lambda link: (link.delay_min_ns / 1e9, link.delay_max_ns / 1e9)),
+        losses=_of_channels(plan, lambda link: (link.loss,) if link.loss else ()),
+        policies=_of_channels(plan, lambda link: () if link.policy == "hold" else (link.policy,)),
+        random=is_random(plan),
+        verdict=verdict,
+        calm=left_out,
+        settles=verdict.settles,
         torque_loop_diverges=not all(loop.stable for loop in loops),
-        hyperperiod=found.hyperperiod,
-        spectral_radius=found.radius,
-        time_constant=_finite(found.time_constant),
-        centroid_age=found.centroid_age,
+        hyperperiod=H_s,
+        spectral_radius=None if not exact else 0.0 if verdict.rate is None else exp(-verdict.rate * H_s),
+        time_constant=None if not verdict.rate else abs(1 / verdict.rate),
+        centroid_age=0.0 if found is None else found.centroid_age,
         blocks=blocks,
-        settling=tuple(SettlingResult(one.block, one.band, one.settled) for one in predicted_settling(plan)),
+        settling=() if found is None else _settling(still),
+        cost=cost,
         table=table,
+        effects=effects,
+        blackouts=own.blackouts(),
         epsilon=epsilons,
         coupling=coupling,
         torque_loops=loops,
@@ -114,61 +140,62 @@ def scaled_delays(plan: Plan, time_scales: str, epsilon: Sequence[float], say: S
             delay_margin(linear_gains(scaled, block, 0.0)) or 0.0 for block in scaled.blocks if block.name in gains
         ]
         rows = tuple(
-            _links(one, largest_extra_delay(scaled, one.edges)) for one in link_sets(scaled) if one.kind == "class"
+            links_result(one, largest_extra_delay(scaled, one.edges))
+            for one in link_sets(scaled)
+            if one.kind == "class"
         )
         found.append(ScaledDelays(by, tuple(row for row in rows if row.delay.seconds is not None), min(margins)))
     return tuple(found)
 
 
+def _or_none(make: Callable[[], Made], what: str, skipped: list[str]) -> Made | None:
+    """Returns what can be predicted; None if it cannot, and `skipped` gets a line about it."""
+    try:
+        return make()
+    except PredictionError as error:
+        skipped.append(f"{what}: {error}")
+        return None
+
+
+def _of_channels(plan: Plan, of: Callable[[LinkPlan], tuple[Value, ...]]) -> dict[str, tuple[Value, ...]]:
+    """Returns for each channel the values of its links, each once, in ascending order; channels without values are left out."""
+    found = {
+        channel.name.lower(): tuple(sorted({each for link in ruled_links(plan, channel) for each in of(link)}))
+        for channel in CHANNELS
+    }
+    return {channel: values for channel, values in found.items() if values}
+
+
+def _each_once(instants_ns: Iterable[int]) -> tuple[float, ...]:
+    """Returns times in seconds, each once, in ascending order."""
+    return tuple(each / 1e9 for each in sorted(set(instants_ns)))
+
+
+def _settling(plan: Plan) -> tuple[SettlingResult, ...]:
+    return tuple(SettlingResult(one.block, one.band, one.settled) for one in predicted_settling(plan))
+
+
 def _assumptions(plan: Plan) -> tuple[str, ...]:
     bus = ("bus and drives take no time",) if plan.can.closed else ()
-    events = ("blackouts of links are left out",) if any(link.blackouts for link in plan.links) else ()
+    events = (
+        ("blackouts of links are left out, but for what is said of each",)
+        if any(link.blackouts for link in plan.links)
+        else ()
+    )
     return (
         "robots follow the desired accelerations exactly",
         "no limit acts",
         "avoidance does not act",
         *bus,
         *events,
-        "the delays are constant, and beyond those of the scenario",
+        "the delays in the tables are constant, and beyond those of the scenario",
     )
 
 
-def _table(plan: Plan, members: bool, say: Say) -> Iterable[LinksResult]:
-    """Yields what sets of links bear; the same links are computed once."""
-    sets = [one for one in link_sets(plan) if members or one.kind not in OF_MEMBERS]
-    known: dict[Edges, LargestDelay] = {}
-    count = len(plan.robots)
-    for done, one in enumerate(sets):
-        say(one.name, done, len(sets))
-        if one.edges not in known:
-            known[one.edges] = largest_extra_delay(plan, one.edges)
-        loss = None
-        if one.kind == "class":
-            why = f"only computed for up to {MOST} robots, here are {count}" if count > MOST else ""
-            loss = LossResult(None, "not computed", why) if why else _loss(plan, one.edges)
-        yield _links(one, known[one.edges], loss)
-
-
-def _loss(plan: Plan, edges: Edges) -> LossResult:
-    """Returns how many messages of some links may be lost in the mean square."""
-    try:
-        found = mean_square(plan, [link for link in plan.links if edge_of(link) in edges], largest=LARGEST)
-    except PredictionError as error:
-        return LossResult(None, "not computed", str(error))
-    return LossResult(found.loss, found.ends, "")
-
-
-def _links(one: LinkSet, found: LargestDelay, loss: LossResult | None = None) -> LinksResult:
-    channel = None if one.channel is None else one.channel.name.lower()
-    seconds = None if found.seconds is None else _finite(found.seconds)
-    delay = DelayResult(seconds, found.ticks, found.tick_s, found.ends, found.tried, found.limits)
-    return LinksResult(one.kind, one.name, one.layer, channel, len(one.edges), one.like, delay, loss)
-
-
-def _modes(plan: Plan) -> Iterable[ModesResult]:
+def _modes(plan: Plan, cost: CostResult) -> Iterable[ModesResult]:
     """Yields the modes of the blocks; blocks that are alike once."""
     of_name = {block.name: block for block in plan.blocks}
-    hyperperiod, shares = plan.root.period_ns * 1e-9, _cost_shares(plan)
+    hyperperiod, shares = plan.root.period_ns * 1e-9, {one.block: one.share for one in cost.blocks}
     for one in block_modes(plan):
         rate = one.rate(hyperperiod)
         yield ModesResult(
@@ -176,24 +203,13 @@ def _modes(plan: Plan) -> Iterable[ModesResult]:
             one.layer,
             one.size,
             one.sigma,
-            _finite(delay_margin(linear_gains(plan, of_name[one.names[0]], 0.0))),
+            finite(delay_margin(linear_gains(plan, of_name[one.names[0]], 0.0))),
             tuple((each.real, each.imag) for each in one.poles),
             tuple((each.real, each.imag) for each in one.eigenvalues),
             None if rate is None else -rate.real,
             None if rate is None else abs(rate.imag),
             sum(shares[name] for name in one.names) if shares else None,
         )
-
-
-def _cost_shares(plan: Plan) -> dict[str, float]:
-    """Returns the share of each block in the expected cost of the run; empty if it is not computed."""
-    if len(plan.robots) > MOST:
-        return {}
-    try:
-        cost = expected_cost(plan)
-    except PredictionError:
-        return {}
-    return {} if cost is None else {block.name: block.share for block in cost.blocks}
 
 
 def _time_scales(
@@ -212,7 +228,7 @@ def _time_scales(
     epsilons = []
     for at, value in enumerate(epsilon):
         low, high = epsilon_range(plan, counts, epsilon, at + 1) if settles else (0.0, inf)
-        sampled = (low or None, _finite(high))
+        sampled = (low or None, finite(high))
         if loop is None or bounds is None:
             uncoupled = None if is_stable_alone else 0.0
             epsilons.append(EpsilonResult(value, *(uncoupled,) * 4, None, *sampled))
@@ -221,10 +237,10 @@ def _time_scales(
         epsilons.append(
             EpsilonResult(
                 value,
-                _finite(largest_epsilon(loop, epsilon, at + 1)),
-                _finite(largest_epsilon(layers, epsilon, at + 1)),
-                _finite(bounds[at].corrected),
-                _finite(bounds[at].by_norms),
+                finite(largest_epsilon(loop, epsilon, at + 1)),
+                finite(largest_epsilon(layers, epsilon, at + 1)),
+                finite(bounds[at].corrected),
+                finite(bounds[at].by_norms),
                 bounds[at].literal,
                 *sampled,
             )
@@ -232,8 +248,4 @@ def _time_scales(
     if loop is None:
         return tuple(epsilons), None
     sampled_limit = coupling_limit(plan) if settles else inf
-    return tuple(epsilons), CouplingResult(_finite(largest_coupling(loop)), _finite(sampled_limit))
-
-
-def _finite(number: float | None) -> float | None:
-    return number if number is not None and isfinite(number) else None
+    return tuple(epsilons), CouplingResult(finite(largest_coupling(loop)), finite(sampled_limit))

@@ -8,7 +8,8 @@ from collections import Counter
 from collections.abc import Callable
 
 from echelon.plan.can_plan import BusRolePlan
-from echelon.plan.plan import LinkPlan, Plan, RobotPlan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan, RobotPlan
 
 
 def link_warnings(plan: Plan) -> list[str]:

@@ -2,11 +2,11 @@
 
 torque path   clock      bridge                drives               referee
 mirror        virtual    run_mirror_bridge     none                 none
-mirror        wall       run_mirror_bridge     none                 run_wall_referee if a bus is a SocketCAN interface
+mirror        wall       run_mirror_bridge     none                 run_wall_referee
 closed        virtual    run_lockstep          run_lockstep         none
-closed        wall       run_wall_bridge       run_wall_drives      run_wall_referee if a bus is a SocketCAN interface
+closed        wall       run_wall_bridge       run_wall_drives      run_wall_referee
 
-Without a referee, can.log is judged after the run.
+The referee has sockets of its own, and judges what was on the buses.  Without a referee, can.log is judged after the run.
 """
 
 import gc
@@ -14,36 +14,34 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
-from echelon.bridge.can.bus import Bus, open_bus
-from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.referee.referee import Referee
+from echelon.bridge.frame_message import FrameBounds
 from echelon.bridge.stations.closed import ClosedBridge
 from echelon.bridge.stations.lockstep_drives import LockstepDrives
 from echelon.bridge.stations.mirror import MirrorBridge
 from echelon.bridge.stations.rail import BusError
-from echelon.bridge.stations.waiting import PROGRESS_NS, Mail, RunClock, drained, wait_for
-from echelon.bridge.stations.wall_bridge import WallBridge
-from echelon.bridge.stations.wall_drives import WallDrives
+from echelon.bridge.stations.waiting import PROGRESS_NS, RunClock
 from echelon.errors import PartRunError
-from echelon.messages import Channel, Message
-from echelon.plan.plan import Plan
+from echelon.messages import Message
 from echelon.role import Role
 from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.session import Session
-from echelon.runtime.wire import data_key, encode, join, watch_key
-from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, hear_finish, meet
+from echelon.runtime.wire import encode, join, watch_key
+from echelon.sim.processes.contract import Body, ProcessSpec, finish, hear_finish, meet, tell
 from echelon.sim.processes.to_supervisor import Failed, PartFailed, Report, Said, Waiting
+from echelon.sim.processes.wall_bus_processes import made, run_wall_bridge, run_wall_drives, run_wall_referee
+from echelon.sim.processes.watch import STOP, Watch
 from echelon.sim.processes.watchers import HIGH_WATER, Reception
 
 PROGRESS_S: Final = PROGRESS_NS / 1e9
 BATCH: Final = 16
 """Largest number of messages with frames in a batch"""
-_T = TypeVar("_T")
+HALT_S: Final = 0.2
+"""How long a bridge that must stop waits for its role to come to rest [s]"""
 
 
 def body_of(spec: ProcessSpec) -> Body:
@@ -57,14 +55,22 @@ def body_of(spec: ProcessSpec) -> Body:
     return run_wall_bridge if spec.kind == "bridge" else run_wall_drives
 
 
-def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
+def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, watch: Watch) -> None:
     """Runs the bridge on the mirrored path: robots' states in; frames on the bus, into can.log, and to the recorder."""
     robots = [robot.index for robot in spec.plan.robots]
-    reception = Reception(session.inbox(watch_key(spec.run, "robot", "**"), HIGH_WATER), robots, spec.plan)
+    hold_s = None if spec.virtual else 0.0  # on a wall clock a frozen robot must not hold up the others
+    reception = Reception(spec, session, robots, HIGH_WATER, hold_s)
     publisher = session.publisher(watch_key(spec.run, "bridge", "frames"))
-    bridge = _made(lambda: MirrorBridge(spec.plan, spec.can_urls, Path(spec.folder)))
+    clock = None if spec.virtual else RunClock()
+    bridge = made(lambda: MirrorBridge(spec.plan, spec.can_urls, Path(spec.folder), clock))
+    stop = watch.stops(bridge.stop)
     control.send(bridge.progress())
-    meet(spec, session, control)
+    start_ns = meet(spec, session, control)
+    signal.signal(STOP, lambda number, frame: None)  # the watch hears of it
+    reception.begin(start_ns)
+    if not spec.virtual:
+        watch.pulse.from_ns = start_ns
+        bridge.clock = RunClock(start_ns)
 
     def take(messages: list[Message]) -> None:
         frames = [encode(message) for message in bridge.take(messages)]
@@ -72,23 +78,29 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection) 
             publisher.put(join(frames[at : at + BATCH]))
 
     said_s = time.monotonic()
-    while True:
-        take(reception.take(PROGRESS_S / 2))
-        now_s = time.monotonic()
-        if now_s - said_s >= PROGRESS_S:
-            said_s = now_s
-            bridge.flush()
-            control.send(bridge.progress())
-        if (order := hear_finish(control)) is not None:
-            break
-    for messages in reception.drain(order.robot_messages):
-        take(messages)
-    bridge.stop()
-    bridge.close()
-    finish(spec, control, report=bridge.report())
+    order = None
+    try:
+        while order is None:
+            take(reception.take(PROGRESS_S / 2))
+            if watch.asked:
+                stop()  # from here on the bridge makes no frames, but robots must not wait for it
+            now_s = time.monotonic()
+            watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
+            if now_s - said_s >= PROGRESS_S:
+                said_s = now_s
+                bridge.flush()
+                tell(control, bridge.progress())
+            order = hear_finish(control)
+        for messages in reception.drain(order.robot_messages):
+            take(messages)
+    finally:
+        stop()
+        bridge.close()
+    watch.pulse.rest()
+    finish(spec, control, report=bridge.report(), refusals=reception.refusals)
 
 
-def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> None:
+def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch: Watch) -> None:
     """Runs bridge or drives on the closed path in virtual time, as a role in lockstep."""
 
     def make() -> ClosedBridge | LockstepDrives:
@@ -96,31 +108,38 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
             return ClosedBridge(spec.plan, spec.can_urls, Path(spec.folder), paired=True)
         return LockstepDrives(spec.plan, spec.can_urls)
 
-    station = _made(make)
+    station = made(make)
     control.send(station.progress())
     role: Role = station
-    runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched)
-    meet(spec, session, control)
+    runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched, frames=FrameBounds(spec.plan))
 
-    def leave(number: int, frame: object) -> None:
+    def halt() -> None:
         station.interrupt()
-        runner.stop()
+        runner.halt(HALT_S)
+        station.stop()
 
-    signal.signal(signal.SIGTERM, leave)
+    stop = watch.stops(halt, at_once=True)
+    meet(spec, session, control)
+    signal.signal(STOP, lambda number, frame: runner.stop())
     lock = threading.Lock()  # two threads send over one pipe
 
     def say(what: Said) -> None:
         with lock:
             control.send(what)
 
+    def say_if_room(what: Said) -> None:
+        with lock:
+            tell(control, what)
+
     gc.collect()
     gc.disable()
     done = threading.Event()
-    teller = threading.Thread(target=_tell, args=(station, say, done), name="progress", daemon=True)
+    teller = threading.Thread(target=_tell, args=(station, say_if_room, done), name="progress", daemon=True)
     teller.start()
     failure: Failed | PartFailed | None = None
+    report: Report | None = None
     try:
-        runner.run(lambda time_ns, sources: say(Waiting(time_ns, tuple(sources))))
+        runner.run(lambda time_ns, sources: say_if_room(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off, but the counts so far are still reported
         pass
     except BusError as error:
@@ -128,20 +147,21 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection) -> No
     except PartRunError as error:
         failure = PartFailed(str(error))
     finally:
+        if spec.kind == "drives":
+            report = station.report()  # of the run, without what ends it
+        try:
+            stop()  # before anything that may wait for others
+        except PartRunError as error:
+            failure = failure or PartFailed(str(error))
         runner.finish()
         done.set()
         teller.join()
-        try:
-            station.stop()
-        except PartRunError as error:
-            failure = failure or PartFailed(str(error))
         station.close()
     if failure is not None:
         say(failure)
         raise SystemExit(1)
-    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
-    report: Report = station.report()
-    finish(spec, control, runner.counts, runner.mailbox.counts(), report)
+    signal.signal(STOP, lambda number, frame: os._exit(0))
+    finish(spec, control, runner.counts, runner.mailbox.counts(), report or station.report(), runner.refusals)
 
 
 def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], done: threading.Event) -> None:
@@ -151,85 +171,3 @@ def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], d
             say(station.progress())
         except OSError:  # the supervisor is gone
             return
-
-
-def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """Runs the bridge on the closed path on a wall clock."""
-    plan = spec.plan
-    assert plan.bridge is not None
-    bridge_key = data_key(spec.run, plan.bridge.path, Channel.WHEELS)
-    watch = session.publisher(watch_key(spec.run, "bridge", "bridge")).put if spec.watched else None
-    wheels = session.publisher(bridge_key).put
-    bridge = _made(lambda: WallBridge(plan, spec.can_urls, Path(spec.folder), wheels, watch))
-    session.subscribe(_torque_keys(spec.run, plan), bridge.mail.receive)
-    control.send(bridge.progress())
-    clock = bridge.clock = RunClock(meet(spec, session, control))
-    said_ns = -1 << 62
-    try:
-        while hear_finish(control) is None:
-            wait_for([control, *bridge.sources], bridge.due_ns - clock.now())
-            bridge.serve()
-            now_ns = clock.now()
-            if now_ns - said_ns >= PROGRESS_NS:
-                said_ns = now_ns
-                control.send(bridge.progress())
-    finally:
-        try:
-            bridge.stop()
-        finally:
-            bridge.close()
-    finish(spec, control, report=bridge.report())
-
-
-def run_wall_drives(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """Runs the virtual drives on a wall clock."""
-    buses = _open_buses(spec.can_urls)
-    drives = WallDrives(spec.plan, buses)
-    mail = Mail(spec.plan, wakes=False)  # wheel speeds are read with the next frame, which is early enough
-    session.subscribe(_torque_keys(spec.run, spec.plan), mail.receive)
-    clock = RunClock(meet(spec, session, control))
-    until_ns: int | None = None
-    while until_ns is None or clock.now() < until_ns:
-        drives.serve(clock, [control])
-        for message in mail.take():
-            drives.bank.turn(clock.now(), message)
-        if until_ns is None and hear_finish(control) is not None:
-            # if the bridge did not stop the drives, wait until their watchdogs have
-            until_ns = clock.now() + (2 * spec.plan.can.watchdog_ns if drives.bank.turning else 0)
-    for bus in buses:
-        bus.close()
-    finish(spec, control, report=drives.report())
-
-
-def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection) -> None:
-    """Runs the referee on a wall clock: it listens to the buses only."""
-    buses = _open_buses(spec.can_urls)
-    # processes wait for a processor, so a frame is late only by a time that a drive's watchdog would almost notice
-    referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
-    clock = RunClock(meet(spec, session, control))
-    while hear_finish(control) is None:
-        wait_for([control, *buses], PROGRESS_NS)
-        for number, bus in enumerate(buses):
-            for received in drained(bus):
-                frame = Frame(received.can_id, received.data, received.remote)
-                referee.observe(clock.of(received.time_ns), number, frame)
-    referee.finish(clock.now())
-    for bus in buses:
-        bus.close()
-    finish(spec, control, report=referee.report("bus"))
-
-
-def _torque_keys(run: str, plan: Plan) -> list[str]:
-    return [data_key(run, robot.path, Channel.TORQUE) for robot in plan.robots]
-
-
-def _made(make: Callable[[], _T]) -> _T:
-    """Calls `make` and returns its result.  Raises StartError if a bus or a file cannot be opened."""
-    try:
-        return make()
-    except (ValueError, OSError) as error:
-        raise StartError(str(error)) from None
-
-
-def _open_buses(urls: Sequence[str]) -> list[Bus]:
-    return _made(lambda: [open_bus(url) for url in urls])

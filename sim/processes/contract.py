@@ -10,6 +10,7 @@ end      the supervisor says `End` when all are done; the process closes its ses
 
 import os
 import resource
+import select
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,20 +19,22 @@ from pathlib import Path
 from typing import Final
 
 from echelon.plan.plan import Plan
+from echelon.runtime.admission import Refusals
 from echelon.runtime.credentials import Credentials
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
 from echelon.runtime.session import Session
-from echelon.runtime.wire import SCHEMA_VERSION, token_key
+from echelon.runtime.wire import SCHEMA_VERSION, token_key, watch_key
 from echelon.sim.observing import Gate
 from echelon.sim.processes.to_process import Finish, Start
-from echelon.sim.processes.to_supervisor import Done, Ready, Report
+from echelon.sim.processes.to_supervisor import Done, Ready, Report, Said
+from echelon.sim.processes.watch import Watch
 
 FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
 """Kinds of processes that get the order to finish, in this order.  Bridge and drives in lockstep do not need it: they are
 members and end with the run."""
-READY_TIMEOUT_S: Final = 20.0
-"""How long a process waits for its peers [s]"""
+READY_TIMEOUT_S: Final = 60.0
+"""How long a process waits for its peers [s]: on a busy machine, or one processor for all, imports take their time"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +76,11 @@ class ProcessSpec:
     """The run goes on though a robot's state is not finite"""
     part_files: dict[str, str] = field(default_factory=dict)
     """Texts of the files of users' parts, by their names in the run's folder"""
+    every_ns: int = 0
+    """On a wall clock: of each channel only the first message in every such time is copied, or recorded [ns]; 0: all"""
 
 
-Body = Callable[[ProcessSpec, Session, Connection], None]
+Body = Callable[[ProcessSpec, Session, Connection, Watch], None]
 """The function that a process runs once it has its session."""
 
 
@@ -103,6 +108,21 @@ def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:
     return told.start_ns
 
 
+def tell(control: Connection, said: Said) -> None:
+    """Sends a message to the supervisor if there is room for it: who drives wheels must not wait for a supervisor that stands
+    still."""
+    if select.select((), (control,), (), 0)[1]:
+        control.send(said)
+
+
+def watch_keys(run: str, plan: Plan, sources: Sequence[int]) -> dict[int, str]:
+    """Returns the keys of the copies of roles, given by their indices in the plan.
+
+    Where torque is mirrored, the index after the last node is the bridge's."""
+    keys = {one.index: watch_key(run, one.role, one.name) for one in plan.all_roles}
+    return {source: keys[source] if source in keys else watch_key(run, "bridge", "frames") for source in sources}
+
+
 def hear_finish(control: Connection) -> Finish | None:
     """Returns the order to finish if it has come."""
     told = control.recv() if control.poll() else None
@@ -115,17 +135,21 @@ def finish(
     runner: RunnerCounts | None = None,
     links: Sequence[LinkCounts] = (),
     report: Report | None = None,
+    refusals: Refusals | None = None,
 ) -> None:
     """Sends the counts of this process and waits for `End`.
 
     A process that closed its session earlier would look dead to its neighbours."""
-    cpu_s, resident = resources()
-    control.send(Done(spec.name, cpu_s, resident, runner, tuple(links), report))
+    cpu_s, memory = resources()
+    refused = {} if refusals is None else refusals.by_source()
+    control.send(Done(spec.name, cpu_s, memory, runner, tuple(links), report, refused))
     control.recv()
 
 
 def resources() -> tuple[float, int]:
-    """Returns the CPU time [s] and the resident memory [bytes] of this process so far."""
+    """Returns the CPU time [s] of this process so far, and its memory [bytes]: its own, and its share of what it has in common
+    with other processes (PSS)."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return usage.ru_utime + usage.ru_stime, pages * resource.getpagesize()
+    lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
+    kilobytes = next(line.split()[1] for line in lines if line.startswith("Pss:"))
+    return usage.ru_utime + usage.ru_stime, 1024 * int(kilobytes)

@@ -1,5 +1,7 @@
-"""How the supervisor ends the processes of a run, in three steps: `stop_members`, `finish_watchers`, `take_down`."""
+"""How the supervisor ends the processes of a run, in four steps: `stop_wheels`, `stop_members`, `finish_watchers`,
+`take_down`.  The first two are for runs that break off; in others the members are done, and the bridge finishes first."""
 
+import signal
 import time
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -12,6 +14,8 @@ from echelon.sim.processes.stalls import STALL_REPORT_S
 from echelon.sim.processes.to_process import End, Finish
 from echelon.sim.processes.to_supervisor import RecorderReport
 
+ZERO_S: Final = 0.5
+"""How long a bridge may take to stop the wheels before the other processes end [s]; after that the drives' watchdogs have"""
 GRACE_S: Final = 3.0
 """How long processes may take to end, and watchers to close their files, when a run breaks off [s]"""
 FINISH_TIMEOUT_S: Final = 60.0
@@ -21,33 +25,54 @@ Serve = Callable[[float], None]
 """Reads what children say, for up to some seconds.  Raises RunError or DivergedError for what ends a run."""
 
 
+def stop_wheels(children: Sequence[Child], serve: Serve) -> None:
+    """Has the bridge take the torque away from all wheels and disable their drives, before anything else ends."""
+    bridges = [child for child in children if child.spec.kind == "bridge" and child.ready]
+    for child in bridges:
+        child.stop()
+    deadline_s = time.monotonic() + ZERO_S
+    while time.monotonic() < deadline_s and any(
+        child.alive and child.done is None and not child.pulse.has_stopped for child in bridges
+    ):
+        try:
+            serve(0.005)
+        except (RunError, DivergedError):
+            pass  # why the run breaks off is known already
+
+
 def stop_members(children: Sequence[Child], serve: Serve) -> None:
     """Ends the members of a run that breaks off.
 
-    They are terminated, so that they can send their last batches; those that do not end within `GRACE_S` are killed."""
+    They are ordered to end, so that they can send their last batches; those that do not end within `GRACE_S` are killed."""
     members = [child for child in children if child.is_member]
     for child in members:
-        if child.process.is_alive():
-            child.process.terminate()
+        if child.done is None:
+            child.stop()
     deadline_s = time.monotonic() + GRACE_S
     # Bridge and drives report their counts before they end, so their pipes must be read meanwhile.
-    while time.monotonic() < deadline_s and any(child.process.is_alive() and child.done is None for child in members):
+    while time.monotonic() < deadline_s and any(child.alive and child.done is None for child in members):
         try:
             serve(0.05)
         except (RunError, DivergedError):
             pass  # why the run breaks off is known already
     for child in members:
-        if child.process.is_alive() and child.done is None:
-            child.process.kill()
+        if child.done is None:
+            child.signal(signal.SIGKILL)
 
 
 def finish_watchers(
-    children: Sequence[Child], serve: Serve, say: Callable[[str], None], failure: str | None, whole: bool
+    children: Sequence[Child],
+    serve: Serve,
+    say: Callable[[str], None],
+    failure: str | None,
+    whole: bool,
+    hurried: Callable[[], bool] = lambda: False,
 ) -> str | None:
     """Lets bridge, drives, referee and recorder finish, in this order; returns the failure of the run, old or new.
 
     If a run is `whole`, every message that was sent arrives, and watchers wait for all of them.  In other runs messages may be
-    lost, and watchers wait until it is silent.  `say` shows a note to the user."""
+    lost, and watchers wait until it is silent.  `say` shows a note to the user.  Once the user is `hurried`, each watcher has
+    `GRACE_S`."""
     links = tuple(counts for child in children if child.done for counts in child.done.links)
     sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
     for child in children:
@@ -63,7 +88,7 @@ def finish_watchers(
                 robot_messages=sent["robot"] if told else None,
                 messages=sum(sent.values()) if told else None,
             )
-            failure = _finish(child, order, serve, say, failure)
+            failure = _finish(child, order, serve, say, failure, hurried)
             if child.done is not None and isinstance(child.done.report, CanReport):
                 sent["bridge"] = child.done.report.messages
     for child in children:
@@ -75,41 +100,61 @@ def finish_watchers(
 
 def _awaits_finish(child: Child) -> bool:
     """Returns whether a process waits for the order to finish."""
-    return not child.is_member and child.ready and not child.control.closed and child.process.is_alive()
+    return not child.is_member and child.ready and not child.control.closed and child.alive
 
 
-def _finish(child: Child, order: Finish, serve: Serve, say: Callable[[str], None], failure: str | None) -> str | None:
-    """Sends the order to finish to a process and waits until it is done; returns the failure of the run, old or new."""
+def _finish(
+    child: Child,
+    order: Finish,
+    serve: Serve,
+    say: Callable[[str], None],
+    failure: str | None,
+    hurried: Callable[[], bool],
+) -> str | None:
+    """Sends the order to finish to a process and waits until it is done; returns the failure of the run, old or new.
+
+    One that somebody has stopped goes on once more, so that it keeps what has come to it: at once if the run has failed, else
+    after `GRACE_S`, and then the run has failed.  What has not finished `GRACE_S` later is given up."""
     try:
         child.control.send(order)
-        begun_s = time.monotonic()
-        patience_s = GRACE_S if failure else FINISH_TIMEOUT_S
-        while child.done is None and child.process.is_alive() and time.monotonic() - begun_s < patience_s:
+        begun_s, continued = time.monotonic(), False
+        while child.done is None and child.alive:
             serve(0.05)
-            if not failure and time.monotonic() - begun_s > STALL_REPORT_S:
+            waited_s, stopped = time.monotonic() - begun_s, child.state() == "stopped"
+            if stopped and not continued and (failure or waited_s > GRACE_S):
+                failure = failure or _lost(child)
+                child.signal(signal.SIGCONT)
+                begun_s, continued = time.monotonic(), True
+            elif waited_s > (GRACE_S if failure or hurried() or stopped else FINISH_TIMEOUT_S):
+                break
+            if not failure and waited_s > STALL_REPORT_S:
                 say(f"waits for {child.name} to finish ({child.state()})")
     except (RunError, DivergedError, OSError) as error:
         failure = failure or str(error)
-    if child.done is None:
-        failure = failure or f"lost {child.spec.kind} ({child.ending()}){last_words_of([child])}"
-    return failure
+    return failure or (_lost(child) if child.done is None else None)
+
+
+def _lost(child: Child) -> str:
+    """Returns in words that a process does not finish."""
+    still = f", {child.state()}" if child.alive else ""
+    return f"lost {child.spec.kind} ({child.ending()}{still}){last_words_of([child])}"
 
 
 def take_down(children: Sequence[Child]) -> None:
-    """Ends all processes: sends `End` to those that are done, terminates the others, and kills what is left after `GRACE_S`."""
+    """Ends all processes: sends `End` to those that are done, orders the others to end, and kills what is left after
+    `GRACE_S`."""
     for child in children:
         if child.done is not None and not child.control.closed:
             try:
                 child.control.send(End())
+                continue
             except OSError:
                 pass
-        elif child.process.is_alive():
-            child.process.terminate()
+        child.stop()
     deadline_s = time.monotonic() + GRACE_S
     for child in children:
-        child.process.join(max(0.0, deadline_s - time.monotonic()))
-        if child.process.is_alive():
-            child.process.kill()
-            child.process.join()
-        child.control.close()
-        child.words.close()
+        if not child.ends_within(max(0.0, deadline_s - time.monotonic())):
+            child.signal(signal.SIGKILL)
+            child.ends_within(GRACE_S)
+        child.process.join(0.2)  # if the fork server is there, it lets the process go
+        child.close()

@@ -4,24 +4,21 @@ from multiprocessing.connection import Connection
 
 from echelon.messages import Channel, Message
 from echelon.runtime.session import Receive, Session
-from echelon.runtime.wire import data_key, encode, watch_key
+from echelon.runtime.wire import data_key, encode
 from echelon.sim.observing import gate_token
 from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
+from echelon.sim.processes.watch import Watch
 from echelon.sim.processes.watchers import HIGH_WATER, PROGRESS_S, Reception
 from echelon.sim.recording.time_order import speakers
 
 
-def run_observers(spec: ProcessSpec, session: Session, control: Connection) -> None:
+def run_observers(spec: ProcessSpec, session: Session, control: Connection, watch: Watch) -> None:
     """Gives on all messages but frames, which can be heard on the buses, each under the key of its member and channel.
 
     They go through a session of their own, which drops what an observer does not take."""
     plan, gate = spec.plan, spec.gate
     assert gate is not None
-    reception = Reception(
-        session.inbox(watch_key(spec.run, "*", "**"), HIGH_WATER),
-        speakers(plan, spec.virtual, bool(spec.can_urls)),
-        plan,
-    )
+    reception = Reception(spec, session, speakers(plan, spec.virtual, bool(spec.can_urls)), HIGH_WATER)
     paths = {one.index: one.path for one in plan.all_roles}
     puts: dict[tuple[int, Channel], Receive] = {}
     try:
@@ -39,9 +36,9 @@ def run_observers(spec: ProcessSpec, session: Session, control: Connection) -> N
 
     with outside:
         outside.declare_token(gate_token(spec.run))
-        meet(spec, session, control)
+        reception.begin(meet(spec, session, control))
         while (order := hear_finish(control)) is None:
             give(reception.take(PROGRESS_S / 2))
         for messages in reception.drain(order.messages):
             give(messages)
-        finish(spec, control)  # before closing, which waits for observers that stand still
+        finish(spec, control, refusals=reception.refusals)  # before closing, which waits for observers that stand still

@@ -1,13 +1,15 @@
 """What the supervisor of a run tells others: its progress while it goes on, and its outcome at the end."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
+from echelon.bridge.referee_reports import RefereeReport
+from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.sim.processes.to_supervisor import Done, RecorderProgress, RecorderReport
+from echelon.sim.results.records import RefusalResult
 from echelon.sim.results.trace import Array, Trace, TraceBuilder
 
 _Report = TypeVar("_Report")
@@ -63,6 +65,25 @@ class Outcome:
     """Why the run broke off; None if it did not"""
     stopped: str | None = None
     """Why the run was stopped before its end though nothing failed; None if it was not"""
+    thinned: int = 0
+    """Messages that were not recorded by rule"""
+    standstills: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """On a wall clock, by name of the process: the longest time for which it stood still, and since when [ns of run time]"""
+    refused_here: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """What the supervisor refused, by source and reason"""
+
+    def refusals(self) -> tuple[RefusalResult, ...]:
+        """Returns what the processes refused, the most frequent first."""
+        found = [
+            RefusalResult(name, source, reason, count)
+            for name, refused in [
+                *((each.name, each.refused) for each in self.processes),
+                ("supervisor", self.refused_here),
+            ]
+            for source, reasons in refused.items()
+            for reason, count in reasons.items()
+        ]
+        return tuple(sorted(found, key=lambda each: -each.messages))
 
 
 def outcome_of(plan: Plan, processes: list[Done], failure: str | None, startup_s: float, wall_s: float) -> Outcome:
@@ -81,6 +102,8 @@ def outcome_of(plan: Plan, processes: list[Done], failure: str | None, startup_s
         startup_s=startup_s,
         wall_s=wall_s,
         messages=0 if recorder is None else recorder.messages,
+        thinned=sum(process.runner.thinned for process in processes if process.runner is not None)
+        + (0 if recorder is None else recorder.thinned),
         failure=failure,
         stopped=None if recorder is None else recorder.stopped(plan),
     )

@@ -6,7 +6,6 @@ Standard error goes to the supervisor.  Standard output, to which users' parts p
 import ctypes
 import gc
 import os
-import select
 import signal
 import sys
 import threading
@@ -17,8 +16,9 @@ from dataclasses import replace
 from io import TextIOWrapper
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from echelon.agents.torque_loop import usual
 from echelon.errors import PartRunError
 from echelon.messages import Heard, Message
 from echelon.role import Role
@@ -29,25 +29,27 @@ from echelon.runtime.paced import PacedRunner
 from echelon.runtime.session import Session
 from echelon.sim.engines.in_process import make_role
 from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, meet
+from echelon.sim.processes.pulse import Pulse
 from echelon.sim.processes.to_supervisor import Failed, LinksProgress, PartFailed, Said, Waiting
+from echelon.sim.processes.watch import STOP, Watch, leave
 
+COMPILED: Final = "echelon.sim.batch.torque_loop"
+"""The module of the compiled torque loop, which takes half a second to import"""
 TOLD_S: Final = 1.0
 """Time between two reports of a member's links, for the live table [s]"""
 
-_PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
-def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
+def main(spec: ProcessSpec, control: Connection, words: Connection, pulses: Any, number: int) -> None:
     """Runs a process of a run until its work is done.  A failure ends the process with exit code 1.
 
-    `control` is its pipe to the supervisor, `words` the pipe that gets its standard error."""
+    `control` is its pipe to the supervisor, `words` the pipe that gets its standard error.  `pulses` has the pulses of all
+    processes of the run, that of this one with the number `number`."""
     gc.freeze()  # what the fork server imported stays; to look through it takes 10 ms and copies its shared pages
-    _die_with(control)
+    watch = Watch(control, Pulse.received(pulses, number), spec.kind)
     _libc.prctl(_PR_SET_NAME, spec.name.encode(), 0, 0, 0)  # the name in ps, top and pgrep (15 characters)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but only the supervisor reacts
-    signal.signal(signal.SIGTERM, _leave)
     try:
         os.dup2(2, 1)
     except OSError:  # the command's standard error is closed
@@ -71,7 +73,7 @@ def main(spec: ProcessSpec, control: Connection, words: Connection) -> None:
         else:
             body = _run_member
         with _open(spec) as session:
-            body(spec, session, control)
+            body(spec, session, control, watch)
     except SystemExit:
         os._exit(0)
     except StartError as error:
@@ -118,7 +120,7 @@ class _LinkTeller:
         return self._told(time_ns, heard)
 
 
-def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> None:
+def _run_member(spec: ProcessSpec, session: Session, control: Connection, watch: Watch) -> None:
     """Runs a robot, a leader or the coordinator."""
     one_at_a_time = threading.Lock()  # stages run in the thread that brings their messages, or in the main thread
 
@@ -126,7 +128,8 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
         with one_at_a_time:
             control.send(said)
 
-    role = _LinkTeller(make_role(spec.plan, spec.index), say)
+    compiled = sys.modules.get(COMPILED)  # the fork server has it if it pays for this run (children.warm_up)
+    role = _LinkTeller(make_role(spec.plan, spec.index, compiled.usual if compiled else usual), say)
     runner: LockstepRunner | PacedRunner
     if spec.virtual:
         runner = LockstepRunner(role, spec.plan, session, spec.run, watched=spec.watched)
@@ -135,10 +138,19 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
             arrivals = ArrivalFile(Path(spec.folder)) if spec.recorded else None
         except OSError as error:
             raise StartError(f"{error.filename}: {error.strerror}") from None
-        runner = PacedRunner(role, spec.plan, session, spec.run, watched=spec.watched, arrivals=arrivals)
+        runner = PacedRunner(
+            role,
+            spec.plan,
+            session,
+            spec.run,
+            watched=spec.watched,
+            arrivals=arrivals,
+            beat=watch.pulse.beat,
+            every_ns=spec.every_ns,
+        )
     role.counts = runner.mailbox.counts
-    start_ns = meet(spec, session, control)
-    signal.signal(signal.SIGTERM, lambda number, frame: runner.stop())
+    start_ns = watch.pulse.from_ns = meet(spec, session, control)
+    signal.signal(STOP, lambda number, frame: runner.stop())
     gc.collect()
     gc.disable()  # the loop makes no reference cycles, and a pause of one role delays all others
     try:
@@ -150,27 +162,6 @@ def _run_member(spec: ProcessSpec, session: Session, control: Connection) -> Non
         pass
     finally:
         runner.finish()  # also if the run breaks off: its messages so far must be recorded
-    signal.signal(signal.SIGTERM, _leave)
-    finish(spec, control, runner.counts, runner.mailbox.counts())
-
-
-def _leave(number: int, frame: object) -> None:
-    """Ends this process after its messages are delivered."""
-    raise SystemExit(0)
-
-
-def _die_with(supervisor: Connection) -> None:
-    """Makes this process end whenever the supervisor ends, even if that is killed."""
-    _libc.prctl(
-        _PR_SET_PDEATHSIG, signal.SIGKILL
-    )  # covers the parent, the fork server, which may outlive the supervisor
-    if os.getppid() == 1:
-        os._exit(1)
-    poller = select.poll()
-    poller.register(supervisor.fileno(), 0)  # 0: only a hang-up is reported
-
-    def wait() -> None:
-        poller.poll()
-        os._exit(1)
-
-    threading.Thread(target=wait, name="supervisor-watch", daemon=True).start()
+    signal.signal(STOP, leave)
+    watch.pulse.rest()
+    finish(spec, control, runner.counts, runner.mailbox.counts(), refusals=runner.refusals)

@@ -28,6 +28,7 @@ def list_specs(
     recorded: bool,
     keep_going: bool,
     gate: Gate | None = None,
+    every_ns: int = 0,
 ) -> list[ProcessSpec]:
     """Returns the specifications of all processes of a run, with their connections.
 
@@ -40,10 +41,11 @@ def list_specs(
 
     Real drives have no process.  The referee connects to no process; it listens to the buses.
     """
-    stations = [role.name for role in plan.bus_roles]
-    if can_urls and not plan.can.closed:
-        stations = ["bridge"]
+    mirrored = bool(can_urls) and not plan.can.closed
+    stations = ["bridge"] if mirrored else [role.name for role in plan.bus_roles]
     watchers = (["recorder"] if recorded else []) + (["observers"] if gate is not None else [])
+    # a mirroring bridge and observers need the copies of all messages; then only the recorder leaves some out
+    members_ns = every_ns if watchers == ["recorder"] and not mirrored else 0
     hubs = watchers + stations
     endpoints = loopback_endpoints(len(plan.nodes) + len(hubs))
     at = {node.index: endpoints.pop() for node in plan.nodes}
@@ -59,6 +61,7 @@ def list_specs(
         "metadata": metadata,
         "part_files": part_files,
         "keep_going": keep_going,
+        "every_ns": every_ns,
         "credentials": NOBODY,
     }
 
@@ -78,8 +81,8 @@ def list_specs(
                 listen=(at[member.index],) if member.index in at else (),
                 connect=(*(() if member.parent is None else (at[member.parent],)), *endpoints_of),
                 peers=(*((plan.formation[peer].role, plan.formation[peer].name) for peer in near), *peers_of),
-                watched=bool(watchers) or (bool(stations) and isinstance(member, RobotPlan) and not plan.can.closed),
-                **common,
+                watched=bool(watchers) or (mirrored and isinstance(member, RobotPlan)),
+                **(common | {"every_ns": members_ns}),
             )
         )
     robots = tuple((robot.role, robot.name) for robot in plan.robots)
@@ -115,8 +118,7 @@ def list_specs(
                 **common,
             )
         )
-    if not virtual and any(url.startswith("socketcan") for url in can_urls):
-        # on other buses it would cost too much to receive each frame once more: there can.log is judged afterwards
+    if not virtual and any(not url.startswith("virtual") for url in can_urls):
         specs.append(
             ProcessSpec(
                 kind="referee", name="referee", index=-1, listen=(), connect=(), peers=(), member=False, **common

@@ -1,21 +1,80 @@
-"""Finds out that a run in virtual time makes no progress, and which processes are to blame.
+"""Finds out which processes hold up a run.
+
+On a wall clock a process that stands still, or is slow, is known by its pulse (`pulse`): it is not at work when it said it
+would be.  A bridge or drives that stand still for `BREAK_S` break the run off, for the watchdogs of the drives have stopped
+the wheels for good; where the drives recover, for `RECOVER_S`.  Others are named, the run goes on without them, and the check
+`standstill` fails the verdict.
 
 In virtual time every member waits for the messages of others, so one process that stands still stops all.  A member that waits
 says so every now and then; a process that says nothing is the one that everyone waits for.
 """
 
+import time
 from collections.abc import Sequence
 from typing import Final
 
 from echelon.plan.plan import Plan
 from echelon.sim.processes.children import Child
-from echelon.sim.processes.failures import StallError, few
+from echelon.sim.processes.failures import RunError, StallError, few
 from echelon.sim.processes.outcome import Progress
 
 STALL_REPORT_S: Final = 3.0
 """After this time without progress a run in virtual time is reported as stalled [s]"""
 SILENT_S: Final = 2.0
 """A process that has said nothing for this time counts as silent [s]"""
+STANDSTILL_S: Final = 0.5
+"""A process on a wall clock that is late by this time is named [s]"""
+BREAK_S: Final = 1.0
+"""A run on a wall clock whose bridge or drives stand still for this time breaks off [s]"""
+RECOVER_S: Final = 10.0
+"""The same where the drives recover from their watchdogs by themselves (`recover_after`) [s]"""
+NAMED_STILL: Final = 3
+"""How many processes a note names that stand still; if there are more, the machine is the likely cause"""
+ASLEEP_S: Final = 0.4
+"""If the supervisor itself was away for this time, the whole machine was, or the whole run was stopped [s]"""
+
+
+class StandstillWatch:
+    """Watches the processes of one run on a wall clock."""
+
+    def __init__(self, plan: Plan, children: Sequence[Child], progress: Progress) -> None:
+        self._plan, self._children, self._progress = plan, children, progress
+        recover = all(robot.drive.recover_ns is not None for robot in plan.robots)
+        self._break_s = RECOVER_S if recover else BREAK_S
+        self._named: set[str] = set()
+        self._looked_ns = 0
+
+    def check(self, now_ns: int) -> None:
+        """Notes in the progress which processes stand still; call it some times a second while the run goes on.
+
+        `now_ns` is on the monotonic clock.  Raises RunError if the bridge or the drives do for `BREAK_S`, or
+        `RECOVER_S`."""
+        asleep, self._looked_ns = now_ns - self._looked_ns > ASLEEP_S * 1e9, now_ns
+        if asleep:  # give all processes the time to go on
+            return
+        overdue_s = {child.name: child.pulse.overdue_ns(now_ns) / 1e9 for child in self._children if child.done is None}
+        still = [child for child in self._children if overdue_s.get(child.name, 0.0) > STANDSTILL_S]
+        if new := [self._text(child, overdue_s[child.name]) for child in still if child.name not in self._named]:
+            more = f"; and {len(new) - NAMED_STILL} more: is the machine too busy?" if len(new) > NAMED_STILL else ""
+            self._progress.note = "; ".join(new[:NAMED_STILL]) + more
+        elif back := sorted(self._named - {child.name for child in still}):
+            self._progress.note = f"{few(back)} {'goes' if len(back) == 1 else 'go'} on"
+        self._named = {child.name for child in still}
+        for child in still:
+            if (
+                self._plan.can.closed
+                and child.spec.kind in ("bridge", "drives")
+                and overdue_s[child.name] > self._break_s
+            ):
+                raise RunError(
+                    f"{self._text(child, overdue_s[child.name])}: longer than the watchdogs of the drives allow"
+                )
+
+    def _text(self, child: Child, still_s: float) -> str:
+        """Returns in words how long a process has stood still, since when, and what the kernel says of it."""
+        from_s = time.monotonic() - still_s - self._progress.started_s
+        about = f"process {child.process.pid}, {child.state()}{child.runs()}"
+        return f"{child.kind_and_name} stands still, for {still_s:.1f} s from t = {from_s:.2f} s on ({about})"
 
 
 class StallWatch:

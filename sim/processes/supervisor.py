@@ -2,9 +2,10 @@
 
 phase          entered when                        what the supervisor does, and what ends the phase
 starting       `run` is called                     starts all processes; ends when all are ready
-running        `Start` is sent to all              watches for lost processes and stalls; ends when all members are done
-breaking off   a failure in one of the above, or   terminates the members, kills those that do not end within `GRACE_S`
-               Ctrl-C
+running        `Start` is sent to all              watches for lost processes and those that stand still; ends when all
+                                                   members are done
+breaking off   a failure in one of the above, or   has the bridge stop all wheels; then orders the members to end, and kills
+               a signal to any process of the run  those that do not within `GRACE_S`
 finishing      members are done or ended           sends `Finish` to bridge, drives, referee and recorder, one after the other
 taking down    all of them are done                sends `End`; kills what is left
 
@@ -12,28 +13,33 @@ The modules beside this one: `specs` lists the processes and `children` starts t
 `endings` has the last three phases; `outcome` is what is told of a run, `failures` why it breaks off.
 
 All processes come from one fork server that has imported their modules, so fifteen start in the time of one.  No process
-outlives the supervisor: each notices the hang-up of its pipe and ends, even if the supervisor was killed.  The processes talk
-over the loopback, at an address and ports of this run alone.
+outlives the supervisor: each notices the hang-up of its pipe and ends, even if the supervisor was killed; the bridge stops the
+wheels first (`watch`).  The processes talk over the loopback, at an address and ports of this run alone.
 """
 
+import os
 import signal
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Final
 
 from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
+from echelon.runtime.admission import Refusals
 from echelon.runtime.arrivals import FILE as ARRIVALS
+from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.observing import new_gate
-from echelon.sim.processes.children import Child, last_words_of, start
+from echelon.sim.processes.children import Child, last_words_of, start, warm_up
 from echelon.sim.processes.contract import ProcessSpec
-from echelon.sim.processes.endings import finish_watchers, stop_members, take_down
+from echelon.sim.processes.endings import finish_watchers, stop_members, stop_wheels, take_down
 from echelon.sim.processes.failures import NAMED, DivergedError, RunError, StallError, few
 from echelon.sim.processes.outcome import Outcome, Progress, outcome_of
+from echelon.sim.processes.pulse import Pulses
 from echelon.sim.processes.specs import list_specs
-from echelon.sim.processes.stalls import StallWatch
+from echelon.sim.processes.stalls import StallWatch, StandstillWatch
 from echelon.sim.processes.to_process import Start, Told
 from echelon.sim.processes.to_supervisor import (
     Done,
@@ -46,14 +52,20 @@ from echelon.sim.processes.to_supervisor import (
     Waiting,
 )
 
-START_TIMEOUT_S: Final = 30.0
+START_TIMEOUT_S: Final = 90.0
 """How long processes may take to become ready [s]"""
 WALL_START_S: Final = 0.1
 """The time from `Start` to run time 0 on a wall clock, at least [s]"""
 WALL_OVERTIME_S: Final = 10.0
 """How long after the end of a run on a wall clock its members may take to be done [s]"""
+LOOK_S: Final = 0.1
+"""Time between two looks at the processes, if none of them says anything [s]"""
+NOT_UNDERSTOOD: Final = "not understood"
+"""Why the supervisor refuses what a process says over its pipe"""
 SHOW_S: Final = 0.2
 """Time between two looks at the progress [s]"""
+GROUP_S: Final = 0.1
+"""How long after a signal to a process the supervisor may get its own, if it was for all of them [s]"""
 
 
 class Supervisor:
@@ -63,8 +75,10 @@ class Supervisor:
     clock.  `can_urls` has a URL for each bus; without it there are no frames.  `scenario_toml`, `metadata` and `part_files`
     (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
     five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up.  With `keep_going` the run
-    does not stop when a robot's state is not finite.  With `observe` it is open to observers, who get the `ticket`.  `order`
-    may change the order in which processes start."""
+    does not stop when a robot's state is not finite.  With `observe` it is open to observers, who get the `ticket`.
+    `interrupted` notes the signals that ask the run to end; without it the supervisor notes them itself.  On a wall clock
+    only the messages of one instant in every `every_ns` are recorded, if it is given (`sim.wall_load`).  `order` may change the
+    order in which processes start."""
 
     def __init__(
         self,
@@ -82,6 +96,8 @@ class Supervisor:
         stall_timeout_s: float = 30.0,
         keep_going: bool = False,
         observe: bool = False,
+        interrupted: Interruption | None = None,
+        every_ns: int = 0,
         order: Callable[[list[ProcessSpec]], list[ProcessSpec]] = lambda specs: specs,
     ) -> None:
         self.plan, self.virtual = plan, virtual
@@ -92,65 +108,129 @@ class Supervisor:
         gate = new_gate(run) if observe else None
         self.ticket = None if gate is None else gate.ticket
         """What observers need to know; None if the run is not open to them"""
-        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going, gate))
+        self._specs = order(
+            list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going, gate, every_ns)
+        )
         self._children: list[Child] = []
+        self.refusals = Refusals()
+        """What processes said over their pipes that is no message of theirs"""
         self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)
+        self._still = StandstillWatch(plan, self._children, self.progress)
+        self._asked, self._startup_s = interrupted, 0.0
 
     def run(self) -> Outcome:
         """Runs the plan; returns when all processes are gone.  Failures are in the outcome, not raised.
 
-        Raises OSError if the file of arrivals cannot be made."""
+        Raises OSError if the file of arrivals cannot be made.  Other errors, which would be faults of this program or of
+        `show`, are raised after all processes have ended."""
         if self._notes_arrivals:
             (self._folder / ARRIVALS).write_bytes(b"")  # members append to it
-        begun_s = time.monotonic()
+        with ExitStack() as stack:
+            if self._asked is None:
+                self._asked = stack.enter_context(interruption())
+            self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+            stack.callback(os.close, self._wake)
+            stack.enter_context(self._asked.during(Raises.NONE, lambda: os.eventfd_write(self._wake, 1)))
+            self._pulses = Pulses(len(self._specs))
+            stack.callback(self._pulses.close)
+            return self._run()
+
+    def _run(self) -> Outcome:
         failure: str | None = None
         stall: StallError | None = None
+        error: BaseException | None = None
         diverged = False
-        startup_s = wall_s = 0.0
-        previous = signal.signal(signal.SIGTERM, _interrupt)
         try:
-            for spec in self._specs:
-                self._children.append(start(spec))
-            self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
-            startup_s = time.monotonic() - begun_s
-            lead_in_s = 0.0 if self.virtual else self._lead_in_s()
-            start_s = time.monotonic() + lead_in_s
-            self._tell_all(Start(round(start_s * 1e9)))
-            self.progress.phase, self.progress.started_s = "running", start_s
-            self._stalls.begin(time.monotonic())
-            members = [child for child in self._children if child.is_member]
-            limit_s = None if self.virtual else lead_in_s + self.plan.duration_ns / 1e9 + WALL_OVERTIME_S
-            self._until(lambda: all(child.done for child in members), limit_s, "not done")
-            wall_s = time.monotonic() - start_s
-            self.progress.phase = "finishing"
-        except StallError as error:
-            stall, failure = error, error.text(f"t = {self.progress.time_ns / 1e9:g} s")
-        except RunError as error:
-            failure = str(error)
-        except DivergedError as error:
-            diverged, self.progress.note = True, f"{error}: the run stops"
-        except KeyboardInterrupt:
-            failure = "interrupted"
+            self._until_members_are_done()
+        except StallError as stalled:
+            stall, failure = stalled, stalled.text(f"t = {self.progress.time_ns / 1e9:g} s")
+        except RunError as why:
+            failure = str(why)
+        except DivergedError as why:
+            diverged, self.progress.note = True, f"{why}: the run stops"
+        except BaseException as other:
+            error, failure = other, f"{type(other).__name__}: {other}"
         broken = diverged or failure is not None
-        if broken:
-            wall_s = max(0.0, time.monotonic() - self.progress.started_s) if self.progress.started_s else 0.0
-            self.progress.note = failure.splitlines()[0] if failure else self.progress.note
+        begun_s = self.progress.started_s
+        wall_s = max(0.0, time.monotonic() - begun_s) if begun_s else 0.0
         try:
             if broken:
+                stop_wheels(self._children, self._serve)
+                if failure is not None:
+                    failure = self._signalled() or failure
+                    self.progress.note = failure.splitlines()[0]
+                standstills = self._standstills()
                 stop_members(self._children, self._serve)
+            else:
+                self.progress.phase = "finishing"
+                standstills = self._standstills()
             whole = self.virtual and not broken  # on a wall clock, messages may be lost on the way
-            failure = finish_watchers(self._children, self._serve, self._say, failure, whole)
-        except KeyboardInterrupt:
-            failure = failure or "interrupted"
+            failure = finish_watchers(
+                self._children, self._serve, self._say, failure, whole, lambda: self._interruption.asked
+            )
+        except BaseException as other:
+            error = error or other
+            raise error from None
         finally:
             take_down(self._children)
-            signal.signal(signal.SIGTERM, previous)
+        if error is not None:
+            raise error
         processes = [child.done for child in self._children if child.done is not None]
-        outcome = outcome_of(self.plan, processes, failure, startup_s, wall_s)
+        outcome = outcome_of(self.plan, processes, failure, self._startup_s, wall_s)
+        outcome.standstills = standstills
+        outcome.refused_here = self.refusals.by_source()
         common_ns = outcome.trace.common_ns()
         if stall is not None and len(common_ns):
             outcome.failure = stall.text(f"t = {common_ns[-1] / 1e9:g} s")
         return outcome
+
+    def _until_members_are_done(self) -> None:
+        """Starts all processes and waits until the members are done.
+
+        Raises RunError or DivergedError if the run breaks off."""
+        begun_s = time.monotonic()
+        warm_up(self.plan)
+        for number, spec in enumerate(self._specs):
+            self._children.append(start(spec, self._pulses, number))
+        self._until(lambda: all(child.ready for child in self._children), START_TIMEOUT_S, "not ready")
+        self._startup_s = time.monotonic() - begun_s
+        lead_in_s = 0.0 if self.virtual else self._lead_in_s()
+        start_s = time.monotonic() + lead_in_s
+        self._tell_all(Start(round(start_s * 1e9)))
+        self.progress.phase, self.progress.started_s = "running", start_s
+        self._stalls.begin(time.monotonic())
+        members = [child for child in self._children if child.is_member]
+        limit_s = None if self.virtual else lead_in_s + self.plan.duration_ns / 1e9 + WALL_OVERTIME_S
+        self._until(lambda: all(child.done for child in members), limit_s, "not done")
+
+    def _standstills(self) -> dict[str, tuple[int, int]]:
+        """Returns for each process the longest time for which it stood still, and from when on in run time [ns]."""
+        if self.virtual or not self.progress.started_s:
+            return {}
+        now_ns, start_ns = time.monotonic_ns(), round(self.progress.started_s * 1e9)
+        found = {child.name: child.pulse.standstill(now_ns) for child in self._children}
+        return {name: (one.lasted_ns, one.from_ns - start_ns) for name, one in found.items() if one.lasted_ns}
+
+    def _signalled(self) -> str | None:
+        """Returns which signal ended the run, in words; None if none did.
+
+        A signal to one process, not to the supervisor, is that process's."""
+        if self._interruption.asked:
+            return "interrupted"
+        for child in self._children:
+            if number := child.pulse.asked_by:
+                deadline_s = time.monotonic() + GROUP_S
+                while not self._interruption.asked and time.monotonic() < deadline_s:
+                    time.sleep(0.005)
+                if self._interruption.asked:
+                    return "interrupted"
+                return f"{child.kind_and_name} was asked to end ({signal.Signals(number).name})"
+        return None
+
+    @property
+    def _interruption(self) -> Interruption:
+        assert self._asked is not None
+        return self._asked
 
     def _lead_in_s(self) -> float:
         """Returns the time from `Start` to run time 0 on a wall clock, in which drives are brought up [s]."""
@@ -161,9 +241,13 @@ class Supervisor:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         shown_s = 0.0
         while not done():
-            self._serve(0.1)
+            self._serve(LOOK_S)
+            if self._interruption.asked or any(child.pulse.asked_by for child in self._children):
+                raise RunError("interrupted")
             self._check_lost()
             now_s = time.monotonic()
+            if self.progress.phase == "running" and not self.virtual:
+                self._still.check(time.monotonic_ns())
             if now_s - shown_s >= SHOW_S:
                 shown_s = now_s
                 if self.progress.phase == "running" and self.virtual:
@@ -188,8 +272,8 @@ class Supervisor:
                 by_handle[child.control] = child
             if not child.words.closed:
                 by_handle[child.words] = child
-        sentinels = [child.process.sentinel for child in self._children if child.done is None]
-        for handle in wait([*by_handle, *sentinels], timeout_s):
+        ends = [child.handle for child in self._children if child.done is None and child.handle >= 0]
+        for handle in wait([*by_handle, *ends, self._wake], timeout_s):
             if isinstance(handle, Connection):
                 child = by_handle[handle]
                 if handle is child.words:
@@ -203,6 +287,9 @@ class Supervisor:
             said: Said = child.control.recv()
         except (EOFError, OSError):
             child.control.close()
+            return
+        except Exception:  # bytes that are no message of a process
+            self.refusals.count(child.name, NOT_UNDERSTOOD)
             return
         child.heard_s = time.monotonic()
         progress = self.progress
@@ -233,11 +320,13 @@ class Supervisor:
                 raise RunError(said.text)
             case Done():
                 child.done = said
+            case _:
+                self.refusals.count(child.name, NOT_UNDERSTOOD)
 
     def _check_lost(self) -> None:
         """Raises RunError if a child has ended without its report."""
         for child in self._children:
-            if child.done is None and not child.process.is_alive():
+            if child.done is None and not child.alive:
                 while not child.control.closed and child.control.poll():
                     self._hear(child)
                 if child.done is None:
@@ -256,7 +345,3 @@ class Supervisor:
                 child.control.send(message)
             except OSError:
                 pass  # the process is lost; `_check_lost` reports it
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt

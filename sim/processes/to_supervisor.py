@@ -1,8 +1,10 @@
 """The messages of a process to the supervisor, over its control pipe."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport, RefereeReport
+from echelon.bridge.referee_reports import RefereeReport
+from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
@@ -45,14 +47,16 @@ class LinksProgress:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The first state that is not finite: of which robot (its index), and when."""
+    """The first state that is not finite, or beyond all bounds: of which robot (its index), and when."""
 
     robot: int
     time_ns: int
+    finite: bool = False
 
     def text(self, plan: Plan) -> str:
         """Returns it in words."""
-        return f"the state of {plan.robots[self.robot].name} is not finite from {self.time_ns / 1e9:g} s on"
+        what = "beyond all bounds" if self.finite else "not finite"
+        return f"the state of {plan.robots[self.robot].name} is {what} from {self.time_ns / 1e9:g} s on"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +78,13 @@ class RecorderReport:
 
     trace: Trace
     messages: int
-    refused: int
-    """Number of invalid batches, and of messages from unknown sources or out of order"""
+    late: int
+    """Number of messages that came too late for their place in the recording, and of states beyond the end"""
     failure: str | None
     lost: Lost | None = None
     """Where the recording ends; None if it goes on to the end"""
+    thinned: int = 0
+    """Messages that it left out by rule"""
 
     def stopped(self, plan: Plan) -> str | None:
         """Returns why the run was stopped before its end though nothing failed; None if it was not."""
@@ -97,10 +103,12 @@ class Done:
 
     name: str
     cpu_s: float
-    resident_bytes: int
+    memory_bytes: int
     runner: RunnerCounts | None = None
     links: tuple[LinkCounts, ...] = ()
     report: Report | None = None
+    refused: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """Messages that it refused, by source and reason (`echelon.runtime.admission`)"""
 
 
 Said = Ready | Failed | PartFailed | Waiting | LinksProgress | BridgeProgress | RecorderProgress | Done

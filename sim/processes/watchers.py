@@ -5,29 +5,40 @@ clock it loses messages and counts them.
 """
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from math import isfinite
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from echelon.bridge.frame_message import unpack
+import numpy as np
+
+from echelon.bridge.frame_message import FrameBounds, unpack
 from echelon.messages import Channel, Message
-from echelon.plan.layout import message_sizes
+from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
+from echelon.runtime.admission import ALWAYS, BEGIN, EARLY_NS, Admission, Refusals, why, within
+from echelon.runtime.admission_rules import admissions_of
 from echelon.runtime.link import LinkCounts
-from echelon.runtime.session import Inbox, Session
-from echelon.runtime.wire import WireError, count_refusal, decode, split, watch_key
-from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet
+from echelon.runtime.session import Session
+from echelon.runtime.wire import WireError, split
+from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet, tell, watch_keys
 from echelon.sim.processes.to_supervisor import Lost, RecorderProgress, RecorderReport
+from echelon.sim.processes.watch import Watch
 from echelon.sim.recording.recorder import Recorder
 from echelon.sim.recording.time_order import TimeOrder, speakers
 from echelon.sim.results.trace import TraceBuilder
 
 PROGRESS_S: Final = 0.2
-SLACK_NS: Final = 60_000_000_000
-"""On a wall clock, messages with times up to this long after the end of the run are accepted."""
+HOLD_S: Final = 0.05
+"""On a wall clock, how long the recorder keeps messages back to put them in order.  With what is not yet on the disk, a killed
+recorder loses 0.2 s"""
+LEAD: Final = 1 << 15
+"""In virtual time, how many of the longest periods a source may be ahead of the slowest one.  Members are near each other, but
+copies come in batches, and some megabytes of one source may be on their way"""
+LATE: Final = "after later messages"
+"""Why a message is refused that has no place in the order of time any more"""
 HIGH_WATER: Final = 256
 """How many batches a watcher may be behind before the run waits for it."""
 WALL_HIGH_WATER: Final = 1 << 15
@@ -39,37 +50,71 @@ SILENCE_S: Final = 0.3
 
 
 class Reception:
-    """Receives batches from the session and puts their messages into one order of time."""
+    """Receives batches of copies and puts their messages into one order of time.
 
-    def __init__(self, inbox: Inbox, sources: Iterable[int], plan: Plan) -> None:
-        self._inbox = inbox
-        self._order = TimeOrder(sources)
-        self._sizes = message_sizes(plan)
-        self._from_ns, self._until_ns = -plan.can.bring_up_ns, plan.duration_ns + SLACK_NS
-        self.refused: dict[str, int] = {}
+    A batch holds messages of the source under whose key it comes; each passes an admission (`echelon.runtime.admission`) before
+    it is kept.  In virtual time a source may be `LEAD` periods ahead of the slowest one, on a wall clock not ahead of time.
+    Messages wait for a silent source for `hold_s` at most; None: for ever."""
+
+    def __init__(
+        self, spec: ProcessSpec, session: Session, sources: Sequence[int], high_water: int, hold_s: float | None = None
+    ) -> None:
+        """Receives from some roles, given by their indices in the plan."""
+        plan = spec.plan
+        self._virtual = spec.virtual
+        self.refusals = Refusals()
+        self._hold_s = hold_s
+        self._order = TimeOrder(sources, hold_s)
+        admissions = admissions_of(plan, sources, self.refusals, virtual=spec.virtual, frames=FrameBounds(plan))
+        self._names = {source: next(each.name for each in admissions if each.source == source) for source in sources}
+        self._admissions: dict[int, dict[bytes, Admission]] = {source: {} for source in sources}
+        for each in admissions:
+            self._admissions[each.source][each.begin] = each
+        self._latest_ns = dict.fromkeys(sources, min(each.time_ns for each in admissions))
+        self._start_ns: int | None = None
+        self._lead_ns = LEAD * max(link.period_ns for link in plan.links)
+        keys = watch_keys(spec.run, plan, sources)
+        doors = {key: partial(self._admit, source) for source, key in keys.items()}
+        self._inbox = session.checked_inbox(doors, high_water)
+
+    def begin(self, start_ns: int) -> None:
+        """Says when the run begins, by `time.monotonic_ns`."""
+        self._start_ns = start_ns
+
+    def _now_ns(self) -> int:
+        """Returns the run time up to which messages may be."""
+        if self._virtual:
+            return min(self._latest_ns.values()) + self._lead_ns
+        return EARLY_NS if self._start_ns is None else time.monotonic_ns() - self._start_ns
+
+    def _admit(self, source: int, batch: bytes) -> list[Message] | None:
+        """Returns the messages of a batch that are admitted, in Zenoh's thread; None if there are none."""
+        name, now_ns = self._names[source], self._now_ns()
+        try:
+            payloads = split(batch)
+        except WireError as error:
+            self.refusals.count(name, error.reason)
+            return None
+        messages = []
+        admissions = self._admissions[source]
+        for payload in payloads:
+            if (admission := admissions.get(payload[:BEGIN])) is None:
+                self.refusals.count(name, why(payload))
+                continue
+            message = admission.admit(payload, now_ns)
+            if message is not None and (message.values.size or message.channel not in ALWAYS):
+                messages.append(message)
+        if not messages:
+            return None
+        self._latest_ns[source] = max(self._latest_ns[source], messages[-1].time_ns)
+        return messages
 
     def take(self, timeout_s: float) -> list[Message]:
         """Waits up to `timeout_s` for a batch; returns the messages whose place in the order is certain by now."""
-        messages: list[Message] = []
-        for batch in self._inbox.take(timeout_s):
-            messages.extend(self._unpack(batch))
-        if not messages:
+        batches = self._inbox.take(timeout_s)
+        if not batches and self._hold_s is None:
             return []
-        return self._order.push(messages)
-
-    def _unpack(self, batch: bytes) -> Iterator[Message]:
-        try:
-            for payload in split(batch):
-                message = decode(payload)
-                size = self._sizes.get((message.source, message.channel), -1)
-                if size is not None and message.values.size not in (0, size):
-                    count_refusal(self.refused, "wrong number of values" if size >= 0 else "of nobody here")
-                elif self._from_ns <= message.time_ns <= self._until_ns:
-                    yield message
-                else:
-                    count_refusal(self.refused, "of another time")
-        except WireError as error:
-            count_refusal(self.refused, error.reason)
+        return self._order.push([message for batch in batches for message in batch], time.monotonic())
 
     def drain(self, expected: int | None) -> Iterator[list[Message]]:
         """Yields the last messages of a run: until `expected` messages have come in all, or (None) until it is silent."""
@@ -81,46 +126,53 @@ class Reception:
                 break
         yield self._order.rest()
 
-    @property
-    def refused_count(self) -> int:
-        """Number of invalid batches, and of messages from unknown sources or out of order."""
-        return sum(self.refused.values()) + self._order.refused
+    def finish(self) -> int:
+        """Ends the reception; returns how many messages came after later ones had been passed on, and are left out.
+
+        In virtual time none does by itself, so there they count as refused."""
+        for source, count in self._order.refused_of.items() if self._virtual else ():
+            self.refusals.count(self._names[source], LATE, count)
+        return self._order.refused
 
 
-def run_recorder(spec: ProcessSpec, session: Session, control: Connection) -> None:
+def run_recorder(spec: ProcessSpec, session: Session, control: Connection, watch: Watch) -> None:
     """Runs the recorder: writes messages to run.mcap and into the trace; sends progress and the trace to the supervisor."""
     plan = spec.plan
     sources = speakers(plan, spec.virtual, bool(spec.can_urls))
     high_water = HIGH_WATER if spec.virtual else WALL_HIGH_WATER
-    reception = Reception(session.inbox(watch_key(spec.run, "*", "**"), high_water), sources, plan)
+    reception = Reception(spec, session, sources, high_water, None if spec.virtual else HOLD_S)
     try:
         recording = RunRecorder(
-            Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files, spec.keep_going
+            Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files, spec.keep_going, spec.every_ns
         )
     except OSError as error:
         raise StartError(f"{error.filename}: {error.strerror}") from None
-    meet(spec, session, control)
+    reception.begin(meet(spec, session, control))
     said_s = time.monotonic()
     while True:
-        recording.add(reception.take(PROGRESS_S / 2))
+        recording.add(reception.take(HOLD_S))
+        recording.recorder.flush_if_due(time.monotonic_ns())
         now_s = time.monotonic()
+        watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
         if now_s - said_s >= PROGRESS_S:
             said_s = now_s
-            recording.recorder.flush_if_due(time.monotonic_ns())
-            control.send(recording.progress())
+            tell(control, recording.progress())
         if (order := hear_finish(control)) is not None:
             break
+    watch.pulse.rest()
     for messages in reception.drain(order.messages):
         recording.add(messages)
     recording.close(order.links)
-    finish(spec, control, report=recording.report(reception.refused_count))
+    finish(spec, control, report=recording.report(reception.finish()), refusals=reception.refusals)
 
 
 class RunRecorder:
     """Writes a run's ordered messages to run.mcap and into the trace.
 
-    Both end with the first instant at which a robot's state is not finite, since soon after that no state is.  With
-    `keep_going` they go on to the end."""
+    With `every_ns` only the first message of each source and channel in every such time is recorded; frames all are.
+
+    Both end with the first instant at which a robot's state is not finite or beyond all bounds (`admission.within`), since soon
+    after that no state is finite.  With `keep_going` they go on to the end."""
 
     def __init__(
         self,
@@ -130,12 +182,18 @@ class RunRecorder:
         metadata: dict[str, str],
         part_files: Mapping[str, str] = MappingProxyType({}),
         keep_going: bool = False,
+        every_ns: int = 0,
     ) -> None:
+        self._every_ns = every_ns
+        self._kept: dict[tuple[int, Channel], int] = {}
+        """The number of the time `every_ns` in which a message of a source and channel was last recorded"""
+        self.thinned = 0
+        """Messages that were not recorded by the rule of `every_ns`"""
         self.recorder = Recorder(folder / "run.mcap", plan, scenario_toml, metadata, part_files)
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self.lost: Lost | None = None
-        """The first state that is not finite"""
+        """The first state that is not finite, or beyond all bounds"""
         self._time_ns = 0
         self._bridge = len(plan.formation)
         self._keep_going = keep_going
@@ -143,20 +201,30 @@ class RunRecorder:
     def add(self, messages: Sequence[Message]) -> None:
         """Takes messages in order of time."""
         recorder, trace = self.recorder, self._trace
+        if self.lost is None and not self._keep_going:
+            self.lost = _first_lost(messages)
+        last_ns = self.lost.time_ns if self.lost is not None else NEVER_NS
         for message in messages:
-            if self.lost is not None and message.time_ns > self.lost.time_ns:
+            if message.time_ns > last_ns:
                 return
             self.messages += 1
-            self._time_ns = message.time_ns
-            if message.channel is Channel.STATE and not self._keep_going and self.lost is None and _is_lost(message):
-                self.lost = Lost(message.source, message.time_ns)
+            self._time_ns = max(self._time_ns, message.time_ns)
             if message.channel is Channel.FRAMES:
                 if message.source == self._bridge:  # its messages contain the drives' frames, too
                     for timed in unpack(message.values):
                         recorder.record_frame(timed)
-            else:
+            elif not self._every_ns or self._keeps(message):
                 trace.add(message)
                 recorder.record(message)
+
+    def _keeps(self, message: Message) -> bool:
+        """Returns whether a message is recorded by the rule of `every_ns`; counts those that are not."""
+        number, of = message.time_ns // self._every_ns, (message.source, message.channel)
+        if self._kept.get(of) == number:
+            self.thinned += 1
+            return False
+        self._kept[of] = number
+        return True
 
     def progress(self) -> RecorderProgress:
         """Returns the progress of the recording."""
@@ -168,16 +236,22 @@ class RunRecorder:
         self.recorder.record_links(self._time_ns, links)
         self.recorder.close()
 
-    def report(self, refused: int = 0) -> RecorderReport:
-        """Returns the report with the trace; `refused` is the number of messages that were refused before."""
-        trace, refused = self._trace.build(), refused + self._trace.surplus
-        return RecorderReport(trace, self.messages, refused, self._failure, self.lost)
+    def report(self, late: int = 0) -> RecorderReport:
+        """Returns the report with the trace; `late` is the number of messages that came too late to be recorded."""
+        trace, late = self._trace.build(), late + self._trace.surplus
+        return RecorderReport(trace, self.messages, late, self._failure, self.lost, self.thinned)
 
     @property
     def _failure(self) -> str | None:
         return self.recorder.failure or self._trace.failure
 
 
-def _is_lost(message: Message) -> bool:
-    """Returns whether a value of a message is not finite."""
-    return not all(map(isfinite, message.values.tolist()))
+def _first_lost(messages: Sequence[Message]) -> Lost | None:
+    """Returns the first state that is not finite or beyond all bounds; None if all are within."""
+    states = [message for message in messages if message.channel is Channel.STATE]
+    if not states or within(np.concatenate([state.values for state in states])):
+        return None
+    for state in states:
+        if not within(state.values):
+            return Lost(state.source, state.time_ns, bool(np.isfinite(state.values).all()))
+    return None  # only their sum is beyond

@@ -18,7 +18,6 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
@@ -31,6 +30,7 @@ from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import CHUNK_SIZE, MAGIC, METADATA
 from echelon.sim.recording.recorder import LINKS, SCENARIO, state_topic, torque_topic
 from echelon.sim.recording.ros_definitions import schema_name, schema_text
+from echelon.sim.recording.unpacking import room_of, unpack
 from echelon.sim.results.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
@@ -216,6 +216,7 @@ def records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord
     Raises ValueError for a damaged record, unless `damaged` is given: then the record is skipped, and its error added to
     `damaged`.  Raises CutError where the file is cut off."""
     size = path.stat().st_size
+    room = room_of(size)
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError("is no MCAP file")
@@ -232,7 +233,13 @@ def records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord
                 elif reader is None:
                     file.seek(length, 1)
                 else:
-                    yield from _unpacked(opcode, file.read(length))
+                    record = _record(opcode, file.read(length))
+                    if isinstance(record, Chunk):
+                        data = _unpacked(record, room)
+                        room -= len(data)
+                        yield from _records_in(data)
+                    else:
+                        yield record
             except ValueError as error:
                 if damaged is None:
                     raise
@@ -240,18 +247,27 @@ def records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord
     raise CutError("is cut short; mend it with `echelon recover`")
 
 
-def _unpacked(opcode: int, body: bytes) -> list[McapRecord]:
-    """Returns the record with this content; if it is a chunk, the records in it.  Raises ValueError if it is damaged."""
+def _record(opcode: int, body: bytes) -> McapRecord:
+    """Returns the record with this content.  Raises ValueError if it is damaged."""
     try:
         if opcode == Opcode.ATTACHMENT and zlib.crc32(body[:-4]) != struct.unpack("<I", body[-4:])[0] != 0:
             raise ValueError("checksum")
-        record = _READERS[Opcode(opcode)](ReadDataStream(BytesIO(body)))
-        if not isinstance(record, Chunk):
-            return [record]
-        stream, length = get_chunk_data_stream(record, validate_crc=True)
-        data = stream.read(length)
+        record: McapRecord = _READERS[Opcode(opcode)](ReadDataStream(BytesIO(body)))
+        return record
     except Exception as error:  # the parsers raise all kinds of errors for damaged bytes
         raise ValueError(f"is damaged: a {Opcode(opcode).name.lower()} cannot be read") from error
+
+
+def _unpacked(chunk: Chunk, room: int) -> bytes:
+    """Returns the records of a chunk, as bytes.  Raises ValueError if it is damaged or has more than `room` bytes, unpacked."""
+    try:
+        return unpack(chunk, room)
+    except Exception as error:  # the unpackers, too
+        raise ValueError("is damaged: a chunk cannot be read") from error
+
+
+def _records_in(data: bytes) -> list[McapRecord]:
+    """Returns the records of an unpacked chunk.  Raises ValueError if it is damaged."""
     records, at = list[McapRecord](), 0
     while at < len(data):
         if at + _RECORD.size > len(data):
@@ -264,7 +280,7 @@ def _unpacked(opcode: int, body: bytes) -> list[McapRecord]:
         if inner == Opcode.MESSAGE:
             records.append(_message(inner_body))
         elif inner in (Opcode.SCHEMA, Opcode.CHANNEL):
-            records.extend(_unpacked(inner, inner_body))
+            records.append(_record(inner, inner_body))
         at += length
     return records
 

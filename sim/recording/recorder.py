@@ -93,7 +93,8 @@ class Recorder:
         """Writes a CAN frame.  Frames from before run time 0 are not written; they are in can.log."""
         time_ns, bus, _, (can_id, data, remote) = timed
         if self._file.failure is None and time_ns >= 0 and bus < len(self._frames):
-            frame = ros.can_frame(ros.stamp(time_ns), can_id, data, remote)
+            head = self._head if time_ns == self._now else ros.stamp(time_ns)
+            frame = ros.can_frame(head, can_id, data, remote)
             self._file.add(self._numbers[self._frame_topics[bus]], self._frames[bus], time_ns, frame)
             self._frames[bus] += 1
 

@@ -17,7 +17,8 @@ from math import gcd
 import numpy as np
 
 from echelon.messages import NULL, Channel, Message
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
 from echelon.runtime.mailbox import Act, Mailbox
 from echelon.runtime.wall_mailbox import WallMailbox, allowed_ns

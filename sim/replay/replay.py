@@ -10,7 +10,8 @@ import numpy as np
 from echelon.errors import UsageError
 from echelon.messages import Channel
 from echelon.plan.layout import message_sizes_of
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.sim.replay.comparison import ChannelComparison, Difference, compare, earliest
 from echelon.sim.replay.feeding import Feeding
 from echelon.sim.replay.rendering import comparison_json, comparison_text, difference_json, difference_text

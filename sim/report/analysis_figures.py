@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from echelon.sim.report.drawing import CENTROID, DASHES, GROUPS, INTER, QUIET, Look, Picture, short
-from echelon.sim.results.analysis import AnalysisResult, LinksResult, ScaledDelays
+from echelon.sim.results.analysis import AnalysisResult
+from echelon.sim.results.links_analysis import LinksResult, PolicyResult, ScaledDelays
 
 LAYERS: Final = {
     "intra": Look(GROUPS[2], DASHES[0], "o"),
@@ -21,6 +22,8 @@ LAYERS: Final = {
     "centroid": Look(CENTROID, DASHES[3], "D"),
     "robot": Look(GROUPS[0], DASHES[4], "v"),
 }
+POLICIES: Final = ("hold", "extrapolate", "predict", "zero")
+"""Policies, each with its own colour and mark"""
 DOWN: Final = ("command", "reference", "torque")
 """Channels towards the robots: their marks are hollow"""
 WIDTH: Final = 7.2
@@ -33,6 +36,9 @@ def analysis_figures(found: AnalysisResult, scaled: Sequence[ScaledDelays], comm
     classes = [one for one in found.table if one.kind == "class" and one.delay.seconds]
     if classes:
         pictures["delays"] = _delays(found, classes, command)
+    effects = [one for one in found.effects if one.delay is not None]
+    if effects:
+        pictures["policies"] = _policies(effects, command)
     if any(each.rows for each in scaled):
         pictures["delays-epsilon"] = _against_epsilon(scaled, command)
     return pictures
@@ -48,6 +54,10 @@ def _delays(found: AnalysisResult, classes: Sequence[LinksResult], command: str)
             look, ms = LAYERS[one.layer or "robot"], 1e3 * (one.delay.seconds or 0.0)
             axes.plot([ms], [at], look.mark, ms=8, mec=look.colour, mew=1.6, mfc=_face(one, look), zorder=3)
             axes.annotate(f"{ms:.4g} ms", (ms, at), (8, 0), textcoords="offset points", va="center", fontsize=8)
+            if (runs := one.delay_by_runs) is not None and runs.value is not None:
+                ends = [1e3 * (end if end else runs.value) for end in (runs.low, runs.high)]
+                axes.plot(ends, [at + 0.2] * 2, color=look.colour, lw=1.4, zorder=2)
+                axes.plot([1e3 * runs.value], [at + 0.2], "x", ms=6, color=look.colour, zorder=3)
             margins = [block.delay_margin for block in found.blocks if block.layer == one.layer and block.delay_margin]
             if margins:
                 axes.plot([1e3 * min(margins)] * 2, [at - 0.3, at + 0.3], color=QUIET, lw=1.2, zorder=2)
@@ -56,10 +66,45 @@ def _delays(found: AnalysisResult, classes: Sequence[LinksResult], command: str)
         axes.margins(x=0.25)
         _plain(axes.xaxis)
         axes.set_xlabel("largest additional delay of all links of the class [ms]")
-        axes.set_title("Delay that each layer bears (line: its block alone, continuous time)")
+        estimated = "; ×: by runs, as the links are" if any(one.delay_by_runs for one in classes) else ""
+        axes.set_title(f"Delay that each layer bears (line: its block alone, continuous time{estimated})")
         _caption(figure, command)
 
     return Picture(WIDTH, 0.42 * len(classes) + 1.5, draw)
+
+
+def _policies(effects: Sequence[PolicyResult], command: str) -> Picture:
+    """Draws the largest delay and loss of each channel with each policy; an arrow: longer ones are not tried."""
+
+    def draw(figure: Figure) -> None:
+        delays, losses = figure.subplots(1, 2, sharey=True)
+        for at, one in enumerate(effects):
+            look = Look.of_run(list(POLICIES).index(one.policy))
+            more = ">" if one.delay_ends == "limit" else look.mark
+            delays.plot([1e3 * (one.delay or 0.0)], [at], more, ms=8, color=look.colour)
+            delays.annotate(_digits(1e3 * (one.delay or 0.0)), (1e3 * (one.delay or 0.0), at), (7, 0),
+                            textcoords="offset points", va="center", fontsize=8)  # fmt: skip
+            if one.loss.share is not None:
+                losses.plot([100 * one.loss.share], [at], ">" if one.loss.ends == "limit" else look.mark, ms=8,
+                            color=look.colour)  # fmt: skip
+        if all(one.delay for one in effects):
+            delays.set_xscale("log")
+            _plain(delays.xaxis)
+        delays.margins(x=0.25)
+        delays.set_yticks(
+            range(len(effects)), labels=[f"{one.channel.replace('_', ' ')}: {one.policy}" for one in effects]
+        )
+        delays.set_ylim(len(effects) - 0.5, -0.5)
+        delays.set_xlabel("largest delay of the channel [ms]")
+        losses.set_xlabel("largest loss in the mean square [%]")
+        figure.suptitle("What policies buy (arrow: this and more)", fontsize=10)
+        _caption(figure, command)
+
+    return Picture(WIDTH, 0.34 * len(effects) + 1.6, draw)
+
+
+def _digits(ms: float) -> str:
+    return f"{ms:.4g} ms"
 
 
 def _eigenvalues(found: AnalysisResult, command: str) -> Picture:

@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Final
 
-from echelon.bridge.reports import BusReport, CanReport, IdentifierReport, RefereeReport
+from echelon.bridge.referee_reports import RefereeReport
+from echelon.bridge.reports import BusReport, CanReport, IdentifierReport
 from echelon.sim.report.page import paragraph, rest, subheading, table
+from echelon.sim.results.can_lines import intrusion_texts, some
 from echelon.sim.results.summary import number
 
 MAX_ROWS: Final = 60
@@ -44,6 +46,8 @@ def _sentences(can: CanReport) -> list[str]:
     if can.stopped:
         reasons = ", ".join(f"{count} times {reason}" for reason, count in can.stopped.items())
         words.append(f"Torques that became zero before the bus: {reasons}.")
+    if can.intrusions:
+        words.append(f"Frames with identifiers of this run came from elsewhere: {some(intrusion_texts(can))}.")
     if clipped := sum(robot.clipped for robot in can.robots.values()):
         words.append(f"In {clipped} frames a torque did not fit and was clipped.")
     if can.torque is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from echelon.files import write_text
 from echelon.sim.report import sections
+from echelon.sim.report.against import measured
 from echelon.sim.report.comparison import WIDTH, Compared, comparison
 from echelon.sim.report.differences import differences
 from echelon.sim.report.drawing import Picture
@@ -20,7 +21,7 @@ def write_report(runs: Sequence[RunForReport], path: Path) -> None:
     """Writes the report of one run, or the comparison of several.  Raises ValueError without a run, and OSError."""
     shown = _shown(runs, WIDTH if len(runs) == 1 else WIDTH / 2 - 0.15)
     title = " · ".join(dict.fromkeys(run.summary.scenario for run in runs))
-    write_text(path, page(f"{title}: {', '.join(run.name for run in runs)}", _parts(title, shown)))
+    write_text(path, page(f"{title}: {', '.join(run.name for run in runs)}", _parts(title, shown)), durable=True)
 
 
 def save_figures(runs: Sequence[RunForReport], folder: Path, formats: Sequence[str]) -> list[Path]:
@@ -86,9 +87,11 @@ def _parts(title: str, shown: Sequence[ShownRun]) -> list[str]:
 def _comparison(shown: Sequence[ShownRun]) -> list[str]:
     """Returns the sections of a comparison: what differs between the runs, and the figures with the curves of all runs."""
     names = [one.run.name for one in shown]
-    rows = differences([one.run.scenario for one in shown], [one.run.summary for one in shown])
+    summaries = [one.run.summary for one in shown]
+    rows = differences([one.run.scenario for one in shown], summaries)
     words = "Keys of the effective scenarios, as --set takes them, and how the runs were made."
     differing = table(["key", *names], rows, numeric_from=len(names) + 1, what="keys")
+    found = table(["", *names], measured(summaries), what="measures")
     figures = "".join(
         figure(picture, f"{caption} Compared: {', '.join(names)}.", caption)
         for picture, caption in comparison(_compared(shown)).values()
@@ -99,6 +102,7 @@ def _comparison(shown: Sequence[ShownRun]) -> list[str]:
             words,
             [differing if rows else paragraph("Nothing: the same scenario, run in the same way.")],
         ),
+        section("What was measured", "The same runs, side by side; details are below.", [found]),
         section("Compared", "The same curves of all runs in one figure; each run by itself is below.", [figures]),
     ]
 

@@ -16,7 +16,7 @@ from echelon.sim.report.page import figure, fold, paragraph, preformatted, rest,
 from echelon.sim.report.run_for_report import FIGURES, RunForReport, ShownRun
 from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.report.torque_steps import steps_text
-from echelon.sim.results.records import DistanceResult
+from echelon.sim.results.measure_records import DistanceResult
 from echelon.sim.results.summary import number
 from echelon.sim.results.verdict import count
 

@@ -6,69 +6,99 @@ Times are in seconds, lengths in metres.  A number that is infinite or does not 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-
-@dataclass(frozen=True, slots=True)
-class DelayResult:
-    """How much later the messages of some links may be, beyond the delays that the scenario gives them."""
-
-    seconds: float | None
-    """Every additional delay up to this is stable [s]; None: none is (`ends` is `unstable`), or all are (`ends` is `never`)"""
-    ticks: int | None
-    """The largest number of whole ticks up to which all are stable; None as for `seconds`"""
-    tick: float
-    """Length of a tick, what divides the periods concerned [s]"""
-    ends: str
-    """Why it is not more: `unstable`: one tick more is unstable; `timeout`: messages are older than their timeout allows;
-    `never`: no delay is unstable; `limit`: longer delays have not been tried out"""
-    tried: bool
-    """True: found by trying delays, which may miss an unstable delay below a stable one"""
-    limits: tuple[str, ...]
-    """The blocks that move in the motion at the edge of stability"""
+from echelon.sim.results.links_analysis import LinksResult, PolicyResult
 
 
 @dataclass(frozen=True, slots=True)
-class LossResult:
-    """How many of the messages of some links may be lost, each by itself, so that the mean square of the errors vanishes."""
+class VerdictResult:
+    """Whether errors vanish with the links as the scenario has them: in the mean square where chance is at work."""
 
-    share: float | None
-    """Largest share of lost messages; None: unstable even without loss, or not computed"""
-    ends: str
-    """`unstable`: with a larger share the mean square grows; `limit`: larger shares were not tried; `not computed`"""
+    method: str
+    """`exact`, or `estimated` from random runs without limits and avoidance"""
+    settles: bool
+    """True if E|e|² vanishes; estimated: if its growth in the last sixth of the runs is below 1"""
+    rate: float | None
+    """Rate at which the root mean square of the errors shrinks in the long run [1/s], negative if it grows; None: infinite"""
+    rate_low: float | None
+    """Lower end of its 95 % interval; equal to `rate` if it is exact"""
+    rate_high: float | None
+    """Upper end"""
+    typical_rate: float | None
+    """Rate at which almost every single run shrinks [1/s], estimated (docs/architecture.md, 2.11); None: nothing is random, or
+    not computed"""
+    typical_error: float | None
+    """Its standard error"""
+    runs: int
+    """Number of runs of the estimate; 0 if it is exact"""
     why: str
-    """Why it is not computed; empty if it is"""
+    """Why it is not exact; empty if it is"""
 
 
 @dataclass(frozen=True, slots=True)
-class LinksResult:
-    """What some links bear together, a row of the table layer × channel."""
+class BlockCostResult:
+    """The expected integral of the squared error of one block."""
 
-    kind: str
-    """`class` (a layer and a channel), `channel`, `layer`, `all`, `group` or `robot`"""
-    name: str
-    """Which links they are, in words"""
-    layer: str | None
-    """Their layer: `intra`, `middle`, `inter`; `robot` for torques on their way to the drives; None: several"""
-    channel: str | None
-    """Their channel; None: several"""
+    block: str
+    """Name of the block"""
+    value: float
+    """[m² s]"""
+    error: float
+    """Standard error of an estimate; 0 if it is exact"""
+    share: float
+    """Its share of the sum over all blocks"""
+
+
+@dataclass(frozen=True, slots=True)
+class CostResult:
+    """The expected integral of the squared errors, from the scenario's start, with its links as they are."""
+
+    method: str
+    """`exact`: until all errors have vanished; `estimated`: the mean over random runs of the scenario's duration; `not
+    computed`"""
+    total: float | None
+    """Sum over the blocks [m² s]; None: not computed"""
+    error: float
+    """Standard error of an estimate of the sum; 0 if it is exact"""
+    blocks: tuple[BlockCostResult, ...]
+    """By block; empty if it is not computed"""
+    runs: int
+    """Number of runs of the estimate"""
+    why: str
+    """Why it is not exact, or not computed"""
+
+
+@dataclass(frozen=True, slots=True)
+class BlackoutBlockResult:
+    """The error of a block in and after a blackout."""
+
+    block: str
+    """Name of the block"""
+    peak: float
+    """Largest |e| from the beginning of the blackout on [m]; estimated: largest root mean square over the runs"""
+    peak_time: float
+    """When it is so large [s of run time]"""
+    recovery: float | None
+    """How long after the end |e| comes to stay below what it was at the beginning [s]; None: not within the run"""
+
+
+@dataclass(frozen=True, slots=True)
+class BlackoutResult:
+    """A window of time in which some links of the scenario lose all messages."""
+
+    channels: tuple[str, ...]
+    """Their channels"""
     links: int
     """How many links they are"""
-    like: tuple[str, ...]
-    """For a robot or a group: all robots or groups for which the answer is the same"""
-    delay: DelayResult
-    """How much later their messages may be"""
-    loss: LossResult | None
-    """How many of their messages may be lost; None: only computed for classes"""
-
-
-@dataclass(frozen=True, slots=True)
-class ScaledDelays:
-    """What link classes bear when all ε are multiplied by a number."""
-
-    by: float
-    rows: tuple[LinksResult, ...]
-    """The classes; empty if the scenario is not stable then"""
-    alone: float
-    """The smallest delay margin of a block alone, in continuous time [s]"""
+    at: float
+    """Begin [s of run time]"""
+    duration: float
+    """[s]"""
+    method: str
+    """`exact`, `estimated` or `not computed`"""
+    blocks: tuple[BlackoutBlockResult, ...]
+    """Errors by block; empty if they are not computed"""
+    why: str
+    """Why it is not exact, or not computed"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,15 +205,27 @@ class AnalysisResult:
     torque_periods: tuple[float, ...]
     """Torque periods of the robots [s], each once"""
     delays: Mapping[str, tuple[float, ...]]
-    """For each channel the delays of its links in the scenario [s], each once"""
+    """For each channel the delays of its links in the scenario [s], each once; of those that vary the smallest and the
+    largest"""
+    losses: Mapping[str, tuple[float, ...]]
+    """For each channel of which messages are lost the shares, each once"""
+    policies: Mapping[str, tuple[str, ...]]
+    """For each channel the policies of its links that are not `hold`, each once"""
+    random: bool
+    """True if random numbers decide anything on the links: losses, or delays that vary"""
+    verdict: VerdictResult
+    """Whether errors vanish with the links as they are"""
+    calm: str
+    """What is left out in what follows, where exact numbers are for constant delays alone; empty: nothing, the links have
+    constant delays and lose nothing"""
     settles: bool
-    """True if errors decay in the long run with the scenario's periods and delays"""
+    """True if errors decay in the long run with the scenario's periods and links: that of `verdict`"""
     torque_loop_diverges: bool
     """True if the torque loop of a robot is unstable"""
     hyperperiod: float
     """Period of the coordinator [s]; all other periods divide it"""
-    spectral_radius: float
-    """By how much errors are multiplied in a hyperperiod in the long run"""
+    spectral_radius: float | None
+    """By how much errors are multiplied in a hyperperiod in the long run: their root mean square; None: estimated only"""
     time_constant: float | None
     """Time in which errors decay, or grow, by the factor e [s]; None: never"""
     centroid_age: float
@@ -193,8 +235,14 @@ class AnalysisResult:
     """Modes of the blocks"""
     settling: tuple[SettlingResult, ...]
     """Predicted settling; empty for more than 200 robots, and where `law.reference = "now"` and states are late"""
+    cost: CostResult
+    """Expected cost with the links as they are"""
     table: tuple[LinksResult, ...]
     """What links bear; empty if the scenario does not settle"""
+    effects: tuple[PolicyResult, ...]
+    """What each policy buys on each channel; empty if it is not computed"""
+    blackouts: tuple[BlackoutResult, ...]
+    """Blackouts of the scenario's links"""
     epsilon: tuple[EpsilonResult, ...]
     """How large each of `law.epsilon` may be; empty if it is not computed"""
     coupling: CouplingResult | None

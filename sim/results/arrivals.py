@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.plan.delay_tables import LOST, DelayTrace
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 
 Whole = NDArray[np.int64]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from echelon.sim.results.can_lines import finding_text, some
+from echelon.sim.results.can_lines import finding_text, intrusion_texts, some
 from echelon.sim.results.evidence import Evidence
 from echelon.sim.results.verdict import CheckResult, count
 
@@ -44,3 +44,19 @@ def referee(evidence: Evidence) -> Iterator[CheckResult]:
         else f"nothing breaks the contract in {can.referee.frames} frames{can.referee.up_to}"
     )
     yield CheckResult("referee", "failed" if total else "passed", text, float(total), "findings", 0.0)
+
+
+def senders(evidence: Evidence) -> Iterator[CheckResult]:
+    """On a bus that other programs can reach: nobody else sent frames with identifiers of the run."""
+    can = evidence.can
+    if can is None or not can.listen:
+        return
+    total = sum(row.frames for row in can.intrusions)
+    if total:
+        who = tuple(dict.fromkeys(row.sender for row in can.intrusions))
+        text = f"{count(total, 'frame')} with identifiers of this run came from elsewhere: {some(intrusion_texts(can))}"
+        yield CheckResult("senders", "failed", text, float(total), "frames", 0.0, who)
+    else:
+        yield CheckResult(
+            "senders", "passed", "nobody else sent frames with identifiers of this run", 0.0, "frames", 0.0
+        )

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Final
 
-from echelon.bridge.reports import CanReport, RefereeReport
+from echelon.bridge.referee_reports import RefereeReport
+from echelon.bridge.reports import CanReport
 
 SHOWN: Final = 5
 """Items that a list shows in full; the rest are counted."""
@@ -15,9 +16,9 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
     if can is None or not can.frames:
         return
     facts = [f"{can.frames} frames"]
+    lost, destroyed = sum(bus.lost for bus in can.buses), sum(bus.destroyed for bus in can.buses)
+    facts += [f"{lost} lost"] if lost else []
     if can.path == "closed":
-        lost, destroyed = sum(bus.lost for bus in can.buses), sum(bus.destroyed for bus in can.buses)
-        facts += [f"{lost} lost"] if lost else []
         facts += [f"{destroyed} destroyed and sent again"] if destroyed else []
     else:
         facts.append(f"{sum(robot.clipped for robot in can.robots.values())} clipped")
@@ -37,11 +38,18 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
         yield f"  drives   faults at the end: {some(faults)}"
     if idle := [name for name, row in can.robots.items() if row.enabled is False and not row.fault]:
         yield f"  drives   not enabled at the end: {some(idle)}"
+    if can.intrusions:
+        yield f"  others   frames with identifiers of this run: {some(intrusion_texts(can))}"
     if can.referee is not None:
         found = ", ".join(f"{number} {kind}" for kind, number in can.referee.kinds.items()) or "nothing wrong"
         yield f"  referee  {can.referee.frames} frames{can.referee.up_to}: {found}"
         if can.referee.after_stop:
             yield f"  stop     {can.referee.after_stop}"
+
+
+def intrusion_texts(can: CanReport) -> list[str]:
+    """Returns who sent what with identifiers of the run: `10.0.0.7 sent 100 on can0, 12 times`."""
+    return [f"{row.sender} sent {row.id} on {row.bus}, {row.frames} times" for row in can.intrusions]
 
 
 def finding_text(referee: RefereeReport) -> str:

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from echelon.sim.results.bus_checks import drives, referee
+from echelon.sim.results.bus_checks import drives, referee, senders
 from echelon.sim.results.evidence import Check, Evidence
-from echelon.sim.results.message_checks import late, messages, recording, refused, silence
+from echelon.sim.results.message_checks import late, messages, recording, refused, silence, standstill
 from echelon.sim.results.motion_checks import avoidance, distance, end, finite, growth, saturation, whole
 from echelon.sim.results.records import ClaimResult
 from echelon.sim.results.verdict import CLAIM, CheckResult, Verdict
@@ -26,10 +26,12 @@ CHECKS: Final[Mapping[str, Check]] = MappingProxyType({
     "saturation": saturation,
     "messages": messages,
     "silence": silence,
+    "standstill": standstill,
     "refused": refused,
     "late": late,
     "drives": drives,
     "referee": referee,
+    "senders": senders,
     "recording": recording,
 })  # fmt: skip
 """All health checks by name, in the order in which they are reported; `health.off` in a scenario takes these names"""

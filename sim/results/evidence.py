@@ -8,7 +8,8 @@ from echelon.plan.plan import Plan
 from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.ending import Ending
-from echelon.sim.results.records import LinkResult, RunFacts, TorqueResult
+from echelon.sim.results.measure_records import LinkResult, TorqueResult
+from echelon.sim.results.records import RunFacts
 from echelon.sim.results.trace import Trace
 from echelon.sim.results.verdict import CheckResult
 

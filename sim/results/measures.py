@@ -14,15 +14,15 @@ from echelon.runtime.link import LinkCounts
 from echelon.sim.results.block_series import Blocks, BlockSeries
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.ending import Ending
-from echelon.sim.results.records import (
+from echelon.sim.results.measure_records import (
     BlockResult,
-    ClaimResult,
     DistanceResult,
     LinkResult,
     SeparationResult,
     TorqueResult,
     ViolationResult,
 )
+from echelon.sim.results.records import ClaimResult
 from echelon.sim.results.settling import Settling, settle, start_error
 from echelon.sim.results.trace import Array, Trace
 from echelon.sim.results.verdict import Outcome

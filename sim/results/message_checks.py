@@ -6,7 +6,7 @@ import numpy as np
 
 from echelon.sim.results.can_lines import some
 from echelon.sim.results.evidence import Evidence
-from echelon.sim.results.records import RunFacts
+from echelon.sim.results.records import RunFacts, StandstillResult
 from echelon.sim.results.verdict import CheckResult, Outcome, count
 
 
@@ -61,7 +61,12 @@ def refused(evidence: Evidence) -> Iterator[CheckResult]:
         refused += sum(evidence.can.refused.values())
         refused += sum(evidence.can.drives.refused.values()) if evidence.can.drives is not None else 0
     text = f"{count(refused, 'message')} refused" if refused else "no message was refused"
-    yield CheckResult("refused", "failed" if refused else "passed", text, float(refused), "messages", 0.0)
+    refusals = evidence.run.refusals
+    if refusals:
+        shown = [f"{each.receiver} {each.messages} of {each.source} ({each.reason})" for each in refusals]
+        text += f": {some(shown)}"
+    about = tuple(dict.fromkeys(each.source for each in refusals))
+    yield CheckResult("refused", "failed" if refused else "passed", text, float(refused), "messages", 0.0, about)
 
 
 def late(evidence: Evidence) -> Iterator[CheckResult]:
@@ -77,22 +82,56 @@ def late(evidence: Evidence) -> Iterator[CheckResult]:
     yield CheckResult("late", "failed" if share > bound else "passed", text, share, "", bound)
 
 
+def standstill(evidence: Evidence) -> Iterator[CheckResult]:
+    """On a wall clock: no process that acts stood still for longer than `can.watchdog`, or `health.silence` if the run
+    has no bus."""
+    plan, run = evidence.plan, evidence.run
+    if run.clock != "wall" or not run.standstills:
+        return
+    acting = [*(one.name for one in plan.formation), "bridge", "drives"]
+    found = sorted(((name, run.standstills[name]) for name in acting if name in run.standstills), key=_lasted)[::-1]
+    if not found:
+        return
+    bound_s = plan.health.silence if evidence.can is None else plan.can.watchdog_ns / 1e9
+    over = [
+        f"{name} for {one.lasted:.4g} s from t = {one.since:.4g} s on" for name, one in found if one.lasted > bound_s
+    ]
+    about = tuple(name for name, one in found if one.lasted > bound_s)
+    who, longest = found[0]
+    text = (
+        f"stood still: {some(over)}; at most {bound_s:g} s"
+        if over
+        else f"{who} for {longest.lasted:.3g} s, the longest"
+    )
+    yield CheckResult("standstill", "failed" if over else "passed", text, longest.lasted, "s", bound_s, about)
+
+
+def _lasted(found: tuple[str, StandstillResult]) -> float:
+    return found[1].lasted
+
+
 def recording(evidence: Evidence) -> Iterator[CheckResult]:
-    """Between a robot's first and last state no state is missing, and no line of can.log is missing."""
-    plan, can = evidence.plan, evidence.can
+    """Between a robot's first and last state no state is missing, and no line of can.log is missing.
+
+    A recording that was thinned by rule has the states of fewer instants, and lacks none of these."""
+    plan, can, run = evidence.plan, evidence.can, evidence.run
+    every_ns = round((run.recorded_every or 0.0) * 1e9)
     missing, whose = 0, []
     for robot, times_ns in zip(plan.robots, evidence.trace.times_ns, strict=True):
-        lacks = (int(times_ns[-1]) - int(times_ns[0])) // robot.period_ns + 1 - len(times_ns) if len(times_ns) else 0
-        if lacks:
+        step_ns = max(robot.period_ns, every_ns)
+        lacks = (int(times_ns[-1]) - int(times_ns[0])) // step_ns + 1 - len(times_ns) if len(times_ns) else 0
+        if lacks > 0:
             missing += lacks
-            before_ns = int(times_ns[int(np.argmax(np.diff(times_ns) > robot.period_ns))])
+            before_ns = int(times_ns[int(np.argmax(np.diff(times_ns) > step_ns))])
             whose.append(f"{lacks} of {robot.name} after t = {before_ns / 1e9:g} s")
     lost = (can.log_lost or 0) if can is not None else 0
     if missing or lost:
         parts = [f"{count(missing, 'state')} ({some(whose)})"] * bool(missing) + [f"{lost} lines of can.log"] * bool(
             lost
         )
-        text = f"the recording lacks {' and '.join(parts)}{_busy(evidence.run)}"
+        text = f"the recording lacks {' and '.join(parts)}{_busy(run)}"
+    elif every_ns:
+        text = f"thinned by rule, to an instant every {every_ns / 1e9:g} s ({run.thinned} messages); of these it lacks nothing"
     else:
         text = "the recording lacks nothing"
     outcome: Outcome = "failed" if missing or lost else "passed"

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from echelon.runtime.admission import LARGEST
 from echelon.sim.results.can_lines import some
 from echelon.sim.results.evidence import Evidence
 from echelon.sim.results.settling import start_error
@@ -47,22 +48,24 @@ def whole(evidence: Evidence) -> Iterator[CheckResult]:
 
 
 def finite(evidence: Evidence) -> Iterator[CheckResult]:
-    """All states are finite."""
-    lost: list[tuple[int, str]] = []
+    """All states are finite, and within the bounds of all messages (`echelon.runtime.admission`)."""
+    lost: list[tuple[int, str, bool]] = []
     for robot, states, times_ns in zip(
         evidence.plan.robots, evidence.trace.states, evidence.trace.times_ns, strict=True
     ):
-        wrong = np.flatnonzero(~np.isfinite(states).all(axis=1))
+        with np.errstate(over="ignore", invalid="ignore"):
+            wrong = np.flatnonzero(~(np.linalg.norm(states, axis=1) <= LARGEST))  # also where it is not a number
         if wrong.size:
-            lost.append((int(times_ns[wrong[0]]), robot.name))
+            lost.append((int(times_ns[wrong[0]]), robot.name, bool(np.isfinite(states[wrong[0]]).all())))
     if not lost:
         yield CheckResult("finite", "passed", "all states are finite", 0.0, "robots", 0.0)
         return
-    first_ns, name = min(lost)
+    first_ns, name, is_finite = min(lost)
     others = f"; {len(lost) - 1} more robots have such states, too" if len(lost) > 1 else ""
-    text = f"{name}: a state is not finite from {first_ns / 1e9:g} s on{others}"
+    what = "beyond all bounds" if is_finite else "not finite"
+    text = f"{name}: a state is {what} from {first_ns / 1e9:g} s on{others}"
     yield CheckResult(
-        "finite", "failed", text, float(len(lost)), "robots", 0.0, tuple(name for _, name in sorted(lost))
+        "finite", "failed", text, float(len(lost)), "robots", 0.0, tuple(name for _, name, _ in sorted(lost))
     )
 
 

@@ -2,13 +2,12 @@
 
 import inspect
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from math import isfinite
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from echelon.docstrings import field_docstrings
 from echelon.files import write_text
@@ -35,7 +34,7 @@ def json_text(value: Any) -> str:
 
 def write_summary(summary: Summary, path: Path) -> None:
     """Writes summary.json.  Raises OSError."""
-    write_text(path, json_text(summary) + "\n")
+    write_text(path, json_text(summary) + "\n", durable=True)
 
 
 def read_summary(path: Path) -> Summary:
@@ -53,36 +52,36 @@ def read_summary(path: Path) -> Summary:
 
 def summary_schema() -> dict[str, Any]:
     """Returns the JSON schema of summary.json; descriptions are the docstrings of the records and their fields."""
-    from echelon.bridge import reports
-    from echelon.sim.results import records, verdict
-
-    return _schema(_adapter(), Summary, "summary.json of an echelon run", (records, verdict, reports))
+    return _schema(_adapter(), Summary, "summary.json of an echelon run")
 
 
 def analysis_schema() -> dict[str, Any]:
     """Returns the JSON schema of what `echelon analyse --json` prints."""
     from pydantic import TypeAdapter
 
-    from echelon.sim.results import analysis
+    from echelon.sim.results.analysis import AnalysisResult
 
-    record = analysis.AnalysisResult
-    return _schema(TypeAdapter(record), record, "what echelon analyse --json prints", (analysis,))
+    return _schema(TypeAdapter(AnalysisResult), AnalysisResult, "what echelon analyse --json prints")
 
 
-def _schema(adapter: Any, record: type, title: str, modules: Sequence[ModuleType]) -> dict[str, Any]:
-    """Returns the JSON schema of a record; those of its parts are in some modules."""
+def _schema(adapter: Any, record: type, title: str) -> dict[str, Any]:
+    """Returns the JSON schema of a record and of all records in it."""
     schema: dict[str, Any] = adapter.json_schema(mode="serialization")
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title} | schema
-    known = {
-        value.__name__: value
-        for module in modules
-        for value in vars(module).values()
-        if isinstance(value, type) and is_dataclass(value)
-    }
+    known = {each.__name__: each for each in _records_in(record)}
     for name, table in [*schema.get("$defs", {}).items(), (record.__name__, schema)]:
         if name in known:
             _describe(table, known[name])
     return schema
+
+
+def _records_in(kind: Any) -> Iterator[type]:
+    """Yields the records that a type is made of, itself included."""
+    if is_dataclass(kind) and isinstance(kind, type):
+        yield kind
+    parts = get_type_hints(kind).values() if is_dataclass(kind) else get_args(kind)
+    for part in parts:
+        yield from _records_in(part)
 
 
 @cache

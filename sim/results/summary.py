@@ -12,6 +12,7 @@ from echelon.sim.results.checks import verdict
 from echelon.sim.results.distances import distances
 from echelon.sim.results.ending import endings
 from echelon.sim.results.evidence import Evidence
+from echelon.sim.results.measure_records import LinkResult
 from echelon.sim.results.measures import (
     block_result,
     claim_results,
@@ -20,8 +21,14 @@ from echelon.sim.results.measures import (
     separation_results,
     torque_result,
 )
-from echelon.sim.results.records import FORMAT, LinkResult, PartResult, RunFacts, Summary
+from echelon.sim.results.records import (
+    FORMAT,
+    PartResult,
+    RunFacts,
+    Summary,
+)
 from echelon.sim.results.trace import Trace
+from echelon.sim.results.verdict import count
 
 
 def summarise(
@@ -102,7 +109,11 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield f"  links    {counts}, {_ages(summary.links)}"
     yield from can_lines(summary.can)
     run = summary.run
+    for each in run.refusals:
+        yield f"  refused  {count(each.messages, 'message')} of {each.source} by {each.receiver}: {each.reason}"
     if run.clock == "wall" and run.stages:
+        if run.recorded_every is not None:
+            yield f"  recorded an instant every {number(run.recorded_every, 's')}, {run.thinned} messages left out by rule"
         yield f"  late     {run.late_stages} of {run.stages} stages, at most {number(run.latest, 's')}"
     if run.wall_time is not None:
         yield f"  wall     {number(run.wall_time, 's')}, {number(run.real_time_factor)} times real time"
@@ -114,7 +125,8 @@ def _ages(links: Sequence[LinkResult]) -> str:
     ages = [(link.age_p99, link.age_max, f"{link.source} → {link.receiver}") for link in links]
     used = [(p99, largest, name) for p99, largest, name in ages if p99 is not None and largest is not None]
     if not used:
-        return "no message was used"
+        under_way = sum(link.in_flight for link in links)
+        return f"no message was used{f', {under_way} are still under way' if under_way else ''}"
     oldest = f"oldest in use {number(max(largest for _, largest, _ in used), 's')}"
     p99, _, name = max(used)
     return f"{oldest}; 99 % of uses up to {number(p99, 's')} ({name})" if any(p < q for p, q, _ in used) else oldest

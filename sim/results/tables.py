@@ -20,7 +20,7 @@ from echelon.controller.trajectory import make_trajectory, sample
 from echelon.controller.transformation import Transformation
 from echelon.messages import STATE_FIELDS
 from echelon.sim.results.block_series import Blocks, component_names
-from echelon.sim.results.records import LinkResult
+from echelon.sim.results.measure_records import LinkResult
 from echelon.sim.results.trace import Array, Trace
 
 if TYPE_CHECKING:

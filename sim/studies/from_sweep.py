@@ -1,5 +1,6 @@
 """From a finished sweep to what its figures are drawn from, with predictions."""
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,12 @@ def results_of(sweep: Sweep, *, predict: bool = True) -> StudyResults:
 
     With `predict` boundaries and rates are predicted; for a sweep that is in no folder nothing is predicted."""
     points = dict(sweep.points.columns)
-    keys = tuple(Key.of(key, points[key].tolist()) for key in sweep.keys)
+    scenario = _scenario(sweep)
+    for key in sweep.keys:  # of which channel a rule is says nothing where the channel varies
+        rule, _, last = key.rpartition(".")
+        if last == "channel" and rule[6:].isdigit() and int(rule[6:]) < len(scenario.get("links", [])):
+            scenario["links"][int(rule[6:])]["channel"] = ""
+    keys = tuple(Key.of(key, points[key].tolist(), scenario) for key in sweep.keys)
     searched = sweep.keys[-1] if sweep.design == "find" else ""
     results = StudyResults(
         sweep.scenario,
@@ -44,6 +50,16 @@ def results_of(sweep: Sweep, *, predict: bool = True) -> StudyResults:
     if not predict or sweep.folder is None or results.axis is None:
         return results
     return replace(results, predicted=_Predictor(results, sweep.folder).predicted())
+
+
+def _scenario(sweep: Sweep) -> dict[str, Any]:
+    """Returns the table of the nominal scenario; empty if the sweep has no folder, or if it cannot be read."""
+    if sweep.folder is None:
+        return {}
+    try:
+        return tomllib.loads((sweep.folder / EFFECTIVE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
 
 
 def _boundary(found: Found) -> Boundary:

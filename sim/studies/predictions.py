@@ -14,7 +14,8 @@ from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.linear_run import CHANNELS, LinearRun, ruled_links, untreated
 from echelon.controller.prediction.mean_square import Losses
 from echelon.controller.prediction.spectrum import spectral_radius
-from echelon.plan.plan import BlockPlan, LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import BlockPlan, Plan
 
 FINE: Final = 1e-3
 """How closely a boundary is found by bisection, as a share of the range that was tried"""
@@ -29,8 +30,7 @@ def stable(plan: Plan) -> bool | None:
     try:
         if not untreated(plan):
             return bool(spectral_radius(LinearRun(plan).map()) < 1)
-        lossy = [link for link in plan.links if link.loss]
-        if lossy and all(link.delay_min_ns % plan.formation[link.receiver].period_ns == 0 for link in lossy):
+        if any(link.loss for link in plan.links):
             return Losses(plan, (), None).gain(0.0) < 1
     except PredictionError:
         pass

@@ -50,6 +50,7 @@ def command_of(part: SweepPart) -> str:
         ("--find", part.find), ("--share", share), ("--seeds", part.seeds), ("--engine", part.engine)
     ):  # fmt: skip
         words += [] if value is None else [option, str(value)]
+    words += ["--allow-unstable"] if part.allow_unstable else []
     return shlex.join(words)
 
 
@@ -63,7 +64,7 @@ def request_of(part: SweepPart) -> Request:
         share=part.share,
         seeds=part.seeds,
         engine=part.engine,  # type: ignore[arg-type]  # prepare refuses what is no engine
-        allow_unstable=True,
+        allow_unstable=part.allow_unstable,
     )
 
 

@@ -27,6 +27,7 @@ class SweepPart:
     share: float = 0.9
     seeds: int | None = None
     engine: str | None = None
+    allow_unstable: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from echelon.errors import UsageError
+from echelon.files import read_json
 from echelon.sim.sweep.rows import Rows
 
 NAME: Final = "journal.jsonl"
@@ -32,7 +33,7 @@ class Journal:
         whole = data.rfind(b"\n") + 1
         for number, line in enumerate(data[:whole].splitlines(), start=1):
             try:
-                entry = json.loads(line)
+                entry = read_json(line)
                 self.done.setdefault(entry["task"], entry["rows"])
             except (ValueError, KeyError, TypeError):
                 raise UsageError(f"{path}: line {number} is damaged; move the file away to begin anew") from None

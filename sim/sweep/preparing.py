@@ -12,13 +12,13 @@ from echelon.controller.prediction.spectrum import spectral_radius
 from echelon.errors import UsageError
 from echelon.plan.delay_tables import DelayTrace
 from echelon.plan.plan import Plan
-from echelon.sim.batch.refusals import refusal
+from echelon.sim.batch.refusals import gpu_refusal, refusal
 from echelon.sim.forecast.motion import asked_of, torque_loop_diverges
 from echelon.sim.forecast.verdict import verdict_warnings
+from echelon.sim.results.statistics import runs_needed, wilson
 from echelon.sim.sweep.design import Kind, design
 from echelon.sim.sweep.origin import Origin, Point
 from echelon.sim.sweep.search import Search
-from echelon.sim.sweep.statistics import runs_needed, wilson
 from echelon.sim.sweep.study import FORMAT
 from echelon.sim.sweep.tables import values_text
 from echelon.sim.sweep.values import Vary
@@ -135,6 +135,11 @@ def prepare(request: Request) -> Prepared:
 
         if not is_kept():
             notes.append("the batch engine is compiled now: once on this machine, for about half a minute")
+    if engine == "gpu":
+        from echelon.sim.batch.gpu import is_kept as is_kept_for_gpu
+
+        if not is_kept_for_gpu():
+            notes.append("the batch engine is compiled for the GPU now: once on this machine, for about a minute")
     notes += [note for note in verdict_warnings(nominal.plan) if "claims" not in note or search is None]
     seeds = tuple(range(nominal.plan.seed, nominal.plan.seed + count))
     return Prepared(request, nominal, points, engine, seeds, notes)
@@ -164,10 +169,14 @@ def _engine(asked: EngineName | None, plans: Iterable[Plan]) -> tuple[EngineName
     """Returns the engine, and why it is not the batch engine if nobody asked for another one.  Raises UsageError."""
     if asked is not None and asked not in ENGINES:
         raise UsageError(f"engine = {asked!r}: must be {', '.join(ENGINES)}")
-    why = next((why for plan in plans if (why := refusal(plan))), None) if asked in (None, "batch") else None
+    if asked in ("inprocess", "processes"):
+        return asked, ""
+    why = next((why for plan in plans if (why := refusal(plan))), None)
+    if why is None and asked == "gpu":
+        why = gpu_refusal()
     if why is None:
         return asked or "batch", ""
-    if asked == "batch":
+    if asked is not None:
         raise UsageError(why)
     return "inprocess", why.partition("; use ")[0]
 

@@ -11,8 +11,9 @@ from echelon.plan.plan import Plan
 from echelon.sim.batch.outcomes import BatchRuns
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.ending import growth_of, levels
+from echelon.sim.results.measure_records import LinkResult
 from echelon.sim.results.rates import amplitude
-from echelon.sim.results.records import LinkResult, Summary
+from echelon.sim.results.records import Summary
 from echelon.sim.results.trace import Trace
 from echelon.sim.sweep.verdicts import word_of, words_of
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from echelon.errors import UserError
-from echelon.files import write_text
+from echelon.files import read_json, write_text
 from echelon.sim.sweep.columns import point_columns, run_columns
 from echelon.sim.sweep.search import Found
 from echelon.sim.sweep.tables import Layout, SweepTable, read_csv
@@ -153,7 +153,7 @@ def _header(path: Path) -> list[str]:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path.parent}: is not the folder of a sweep, there is no {path.name}") from None
     except OSError as error:

@@ -8,13 +8,13 @@ from math import inf
 from pathlib import Path
 
 from echelon import __version__
+from echelon.sim.results.statistics import MomentGrowth, wilson
 from echelon.sim.sweep.folder import open_folder, write
 from echelon.sim.sweep.journal import Journal
 from echelon.sim.sweep.origin import Point
 from echelon.sim.sweep.preparing import Prepared, beside, draws
 from echelon.sim.sweep.rows import Rows, blocks_of, channels_of
 from echelon.sim.sweep.search import ALL, By, Found, Judged, Judgements, Search, judgements
-from echelon.sim.sweep.statistics import MomentGrowth, wilson
 from echelon.sim.sweep.study import Sweep
 from echelon.sim.sweep.tables import Layout, PointFacts, growth_of_point, points_table, runs_table, values_text
 from echelon.sim.sweep.work import Task, joined, runs_in_task

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from echelon.errors import UserError
 from echelon.files import replacing
 from echelon.scenario.toml_text import toml_value
+from echelon.sim.results.statistics import MomentGrowth, median, moment_growth, wilson
 from echelon.sim.sweep.columns import NOT_MEDIAN, Column, measures, point_columns, run_columns
 from echelon.sim.sweep.rows import Rows
-from echelon.sim.sweep.statistics import MomentGrowth, median, moment_growth, wilson
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.runtime.link import LinkCounts
 from echelon.sim.batch.outcomes import BatchRuns
 from echelon.sim.results.desired import Desired

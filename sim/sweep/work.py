@@ -18,13 +18,13 @@ from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import TraceBuilder
 from echelon.sim.sweep.rows import Rows, row_of_run, rows_of_batch
 
-EngineName = Literal["batch", "inprocess", "processes"]
-ENGINES: Final[tuple[EngineName, ...]] = ("batch", "inprocess", "processes")
-_COST_S: Final = {"batch": 0.25e-6, "inprocess": 16e-6, "processes": 1.0}
-"""Processor time that a robot takes for a period, roughly [s]"""
-_TASK_S: Final = {"batch": 0.5, "inprocess": 2.0, "processes": 0.0}
+EngineName = Literal["batch", "gpu", "inprocess", "processes"]
+ENGINES: Final[tuple[EngineName, ...]] = ("batch", "gpu", "inprocess", "processes")
+_COST_S: Final = {"batch": 0.25e-6, "gpu": 2e-9, "inprocess": 16e-6, "processes": 1.0}
+"""Time that a robot takes for a period, of a processor or, with many runs at once, of the GPU, roughly [s]"""
+_TASK_S: Final = {"batch": 0.5, "gpu": 4.0, "inprocess": 2.0, "processes": 0.0}
 """How long a task may take, roughly [s]: what is lost if the sweep is killed"""
-MOST_RUNS: Final = 256
+MOST_RUNS: Final = {"batch": 256, "gpu": 65_536, "inprocess": 256, "processes": 256}
 """Largest number of runs in a task"""
 
 
@@ -45,15 +45,16 @@ def runs_in_task(plan: Plan, engine: EngineName) -> int:
     """Returns how many runs a task of this plan has.  It depends on nothing else, so tasks are the same with any workers."""
     periods = plan.duration_ns // gcd(*[robot.period_ns for robot in plan.robots]) + 1
     cost_s = _COST_S[engine] * periods * len(plan.robots)
-    return max(1, min(MOST_RUNS, round(_TASK_S[engine] / cost_s)))
+    return max(1, min(MOST_RUNS[engine], round(_TASK_S[engine] / cost_s)))
 
 
 def work(task: Task) -> Rows:
     """Makes the runs of a task; returns their rows in the order of the seeds."""
-    if task.engine == "batch":
-        from echelon.sim.batch.batch import run_many
+    if task.engine in ("batch", "gpu"):
+        from echelon.sim.batch.batch import Device, run_many
 
-        return rows_of_batch(run_many(task.plan, task.seeds, threads=1, say=lambda text: None))
+        device: Device = "gpu" if task.engine == "gpu" else "processor"
+        return rows_of_batch(run_many(task.plan, task.seeds, device=device, threads=1, say=lambda text: None))
     run = _in_process if task.engine == "inprocess" else _as_processes
     return joined([run(task.scenario, replace(task.plan, seed=seed)) for seed in task.seeds])
 

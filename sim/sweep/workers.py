@@ -64,6 +64,8 @@ def make_workers(engine: EngineName, workers: int | str | None) -> Workers:
     if workers is not None and workers < 1:
         raise UsageError(f"workers = {workers}: must be at least 1")
     count = workers or (1 if engine == "processes" else cores())
+    if engine == "gpu":
+        return ThreadWorkers(1)  # the runs of one task fill it
     return ThreadWorkers(count) if engine == "batch" else ProcessWorkers(count)
 
 

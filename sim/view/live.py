@@ -1,8 +1,16 @@
-"""The display of a run in progress: a live table with a progress bar, or plain lines if there is no terminal."""
+"""The display of a run in progress: a live table with a progress bar, or plain lines if there is no terminal.
+
+A thread of its own writes: a terminal that is stopped (Ctrl-S), or a pipe that nobody reads, must not stop who watches a run.
+"""
 
 import sys
+import threading
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from math import isfinite
+from queue import SimpleQueue
 from typing import Any, TextIO
 
 import numpy as np
@@ -20,6 +28,8 @@ from echelon.sim.results.desired import Desired
 
 PLAIN_S = 2.0
 """Time between two plain lines [s]"""
+CLOSE_S = 10.0
+"""How long the last lines of a run may take to be written [s]"""
 FAULTS = 3
 """How many faults of drives are named; further ones are shown as …"""
 
@@ -39,36 +49,74 @@ class Display:
         self._live: Live | None = None
         self._said_s = time.monotonic()
         self._note = ""
+        self._todo: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._free = threading.Event()
+        """Set while no table waits to be written"""
+        self._free.set()
+        self._writer: threading.Thread | None = threading.Thread(target=self._write, name="display", daemon=True)
+        self._writer.start()
         if not quiet and self._console.is_terminal:
             self._live = Live(console=self._console, auto_refresh=False, transient=True)
-            self._live.start()
+            self._todo.put(self._live.start)
 
     def show(self, progress: Progress) -> None:
-        """Shows the present state of the run."""
+        """Shows the present state of the run; while the last table is not written yet, only notes."""
         note = progress.note or progress.bridge.note or progress.drives.note
         if note and note != self._note:
             self.say(note)
         self._note = note or self._note
-        if self._quiet:
+        if self._quiet or (self._live is not None and not self._free.is_set()):
             return
-        if self._live is not None:
-            self._live.update(self._table(progress), refresh=True)
-        elif time.monotonic() - self._said_s >= PLAIN_S:
+        if self._live is None:
+            if time.monotonic() - self._said_s < PLAIN_S:
+                return
             self._said_s = time.monotonic()
-            print(self._line(progress), file=self._stream, flush=True)
+        self._free.clear()
+        self._todo.put(partial(self._draw, replace(progress, links=dict(progress.links))))
 
     def say(self, text: str) -> None:
         """Prints a line that stays."""
+        if self._writer is None:
+            self._print(text)
+        else:
+            self._todo.put(partial(self._print, text))
+
+    def close(self) -> None:
+        """Removes the table, and waits up to `CLOSE_S` until all is written.  A second call does nothing."""
+        if self._writer is None:
+            return
+        if self._live is not None:
+            self._todo.put(self._end_table)
+        self._todo.put(None)
+        self._writer.join(CLOSE_S)
+        self._writer = None
+
+    def _write(self) -> None:
+        while (work := self._todo.get()) is not None:
+            try:
+                work()
+            except OSError:
+                pass  # the terminal is gone
+
+    def _draw(self, progress: Progress) -> None:
+        try:
+            if self._live is not None:
+                self._live.update(self._table(progress), refresh=True)
+            else:
+                print(self._line(progress), file=self._stream, flush=True)
+        finally:
+            self._free.set()
+
+    def _end_table(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+        self._live = None
+
+    def _print(self, text: str) -> None:
         if self._live is not None:
             self._console.print(text, markup=False, highlight=False)
         else:
             print(text, file=self._stream, flush=True)
-
-    def close(self) -> None:
-        """Removes the table.  A second call does nothing."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
 
     def errors(self, progress: Progress) -> dict[str, float]:
         """Returns the norm of each block's error [m] in the last states of the robots, by the block's name."""

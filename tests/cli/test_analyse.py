@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
+from echelon.cli.analyse_text import lines_of
 from echelon.cli.new_scenario import scenario_text, sizes
+from echelon.controller.prediction.policy_effects import policy_effect
+from echelon.messages import Channel
 from echelon.sim.engines.in_process import Engine
+from echelon.sim.forecast.analysing import analysis_of
+from echelon.sim.forecast.estimating import Estimates, mean_integrals
+from echelon.sim.forecast.motion import asked_of
+from echelon.sim.forecast.own_links import OwnLinks
 from echelon.sim.parts.loading import parse
 from echelon.sim.results.block_series import block_series
-from echelon.sim.results.rendering import analysis_schema
+from echelon.sim.results.rendering import analysis_schema, json_text
 from echelon.sim.results.trace import TraceBuilder
 from support.runs import echelon
 from support.schemas import strict
@@ -166,24 +173,92 @@ def test_the_lab_bears_a_tenth_of_a_second_on_every_link() -> None:
     assert by_name(facts)["command"]["delay"]["seconds"] == pytest.approx(0.15292, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("rule", "named"),
-    [
-        ('{channel="state", loss=0.1}', "9 state links lose 10 % of their messages"),
-        ('{source="g1/r1", delay={min=0.0, max=0.02}}', "1 state links have delays from 0 to 0.02 s"),
-        (
-            '{channel="command", loss=0.5, delay={min=0.01, max=0.02}}',
-            "9 command links lose 50 % of their messages and have delays from 0.01 to 0.02 s",
-        ),
-    ],
-)
-def test_links_that_are_not_treated_are_named_and_no_margin_is_printed(rule: str, named: str) -> None:
-    done = echelon("analyse", "lab", "--set", f"links=[{rule}]")
+def analysed(rules: str, *overrides: str, policies: bool = False) -> dict[str, Any]:
+    """Returns what `echelon analyse --json` says of `FOUR` with these rules for its links; it fits the schema."""
+    scenario, plan = parse(FOUR, "t.toml", (f"links=[{rules}]", *overrides))
+    law = scenario.law
+    found = analysis_of(plan, law.time_scales, law.epsilon, asked_of(plan), policies=policies, runs=16)
+    facts: dict[str, Any] = json.loads(json_text(found))
+    assert [one.message for one in Draft202012Validator(strict(analysis_schema())).iter_errors(facts)] == []
+    assert "\n".join(lines_of(found, ())).startswith("four: channels ")
+    return facts
+
+
+def test_a_scenario_with_lossy_links_is_judged_in_the_mean_square_and_its_cost_is_that_of_runs() -> None:
+    facts = analysed('{channel="state", loss=0.3}')
+    assert facts["losses"] == {"state": [0.3]}
+    verdict = facts["verdict"]
+    assert (verdict["method"], verdict["settles"], verdict["why"]) == ("exact", True, "")
+    assert verdict["typical_rate"] == pytest.approx(verdict["rate"], rel=0.1)
+    assert facts["cost"]["method"] == "exact"
+    assert sum(each["share"] for each in facts["cost"]["blocks"]) == pytest.approx(1)
+    _, plan = parse(FOUR, "t.toml", ('links=[{channel="state", loss=0.3}]',))
+    means, errors, total, error = mean_integrals(Estimates(plan, 256).of(plan))
+    assert facts["cost"]["total"] == pytest.approx(total, rel=1e-3, abs=4 * error)
+    by_block = {block["block"]: block["value"] for block in facts["cost"]["blocks"]}
+    for block, mean, spread in zip(plan.blocks, means, errors, strict=True):
+        assert by_block.get(block.name, 0.0) == pytest.approx(mean, rel=1e-3, abs=4 * spread)
+    (state,) = (row for row in facts["table"] if row["name"] == "intra state")
+    runs = state["delay_by_runs"]  # a loss of 30 % takes some of the delay that is borne without
+    assert runs["value"] <= state["delay"]["seconds"] < 1.3 * runs["value"]
+    assert facts["calm"] == "without losses"
+
+
+def test_delays_that_vary_on_several_links_are_estimated_with_an_interval_and_it_is_said_why() -> None:
+    facts = analysed('{channel="state", delay={min=0.0, max=0.05}}')
+    verdict = facts["verdict"]
+    assert (verdict["method"], verdict["settles"], verdict["runs"]) == ("estimated", True, 16)
+    assert "delays that vary are computed on one link" in verdict["why"]
+    assert verdict["rate_low"] <= verdict["rate"] <= verdict["rate_high"]
+    assert (facts["cost"]["method"], facts["cost"]["runs"]) == ("estimated", 16)
+    assert facts["delays"]["state"] == [0.0, 0.05]
+    assert facts["calm"] == "delays that vary at their mean"
+    alone = analysed('{source="g1/a", delay={min=0.0, max=0.05}}', 'timing="time_driven"')
+    assert alone["verdict"]["method"] == "exact"
+
+
+def test_predict_bears_at_least_five_times_the_delay_that_hold_bears() -> None:
+    driven = ('timing="time_driven"', "periods.acceleration=0.05", "periods.torque=0.05")
+    plan = parse(FOUR, "t.toml", driven)[1]
+    hold, predict = (policy_effect(plan, Channel.STATE, policy, 60) for policy in ("hold", "predict"))
+    assert hold.delay is not None
+    assert predict.delay is not None
+    assert predict.delay >= 5 * hold.delay
+    for policy, delay, settles in (("hold", hold.delay + 0.05, False), ("predict", 5 * hold.delay, True)):
+        rule = f'links=[{{channel="state", delay={delay:g}, policy="{policy}"}}]'
+        for timing in driven[:1], ():  # exactly, and by a run of event-driven nodes
+            late = parse(FOUR, "t.toml", (rule, *timing, *driven[1:], "duration=40"))[1]
+            found = OwnLinks(late, Estimates(late, 8)).verdict()
+            assert found.settles == settles
+            assert found.method == ("exact" if timing or policy == "hold" else "estimated")
+
+
+def test_what_each_policy_buys_is_a_table() -> None:
+    facts = analysed("", "periods.acceleration=0.05", "periods.torque=0.05", policies=True)
+    effects = {(one["channel"], one["policy"]): one for one in facts["effects"]}
+    assert [key for key, one in effects.items() if one["own"]] == [
+        (channel, "hold") for channel in ("state", "group_state", "reference", "command")
+    ]
+    assert effects["state", "predict"]["delay"] >= 5 * effects["state", "hold"]["delay"]
+    assert effects["command", "zero"]["loss"]["share"] > effects["command", "hold"]["loss"]["share"]
+
+
+def test_blackouts_are_told_by_block_exactly_or_by_runs() -> None:
+    event = 'events=[{kind="blackout", channel="state", at=10.0, duration=1.0}]'
+    for rules, method in (("", "exact"), ('{channel="state", loss=0.1}', "estimated")):
+        (found,) = analysed(rules, event)["blackouts"]
+        assert (found["channels"], found["links"], found["at"], found["duration"]) == (["state"], 4, 10.0, 1.0)
+        assert found["method"] == method
+        assert {each["block"] for each in found["blocks"]} == {"g1", "centroid"}
+        assert bool(found["why"]) == (method == "estimated")
+
+
+def test_without_runs_it_is_said_why_nothing_is_known() -> None:
+    rule = 'links=[{channel="state", delay={min=0.0, max=0.05}}]'
+    done = echelon("analyse", "-", "--set", rule, "--runs", "0", typed=FOUR)
     assert (done.returncode, done.stdout) == (2, "")
-    assert (
-        done.stderr
-        == f"echelon: lab: cannot be analysed; run it instead: {named}: only constant delays without loss are treated\n"
-    )
+    assert "nor can it be estimated: no runs are asked for (--runs 0)" in done.stderr
+    assert echelon("analyse", "-", "--runs", "-1", typed=FOUR).returncode == 2
 
 
 def test_messages_older_than_their_timeout_are_named() -> None:
@@ -192,10 +267,11 @@ def test_messages_older_than_their_timeout_are_named() -> None:
     assert "state from g1/r1 to g1 is older than its timeout of 0.1 s when it would be used" in done.stderr
 
 
-def test_delays_too_long_to_compute_with_are_refused_at_once() -> None:
-    done = echelon("analyse", "lab", "--set", "links=[{delay=100.0}]", timeout=60)
-    assert done.returncode == 2
-    assert "delays of up to 100 s are too long to compute with" in done.stderr
+def test_delays_too_long_to_compute_with_are_judged_by_a_run() -> None:
+    facts = analysed("{delay=100.0}")
+    assert "delays of up to 100 s are too long to compute with" in facts["verdict"]["why"]
+    assert not facts["settles"]
+    assert any("what follows from the linear run: delays of up to 100 s" in each for each in facts["not_computed"])
 
 
 def test_margins_of_matrix_gains_are_those_of_the_worst_direction() -> None:

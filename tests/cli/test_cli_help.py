@@ -36,7 +36,7 @@ QUICK = [example for example in EXAMPLES if not example.startswith(LONG) and "vc
 def run_in_shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Runs a command line as a user types it."""
     command = ["bash", "-c", f"export PATH={shlex.quote(str(BIN))}:$PATH; {line}"]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ from echelon.cli.parser import make_parser
 make_parser()
 print(*[name for name in {heavy} if name in sys.modules])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, cwd=ROOT)
     assert (done.stdout, done.stderr) == ("\n", "")
 
 
@@ -217,14 +217,14 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_bash_completes(typed: str, completed: list[str], bash_script: Path, folder: Path) -> None:
     (folder / "my.toml").write_text("")
     command = ["bash", "-c", BASH, "bash", str(bash_script), "echelon", *typed.split(" ")]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
     assert sorted(done.stdout.split()) == completed, done.stderr
 
 
-def test_bash_knows_all_commands_and_all_options(bash_script: Path, folder: Path) -> None:
+def test_bash_knows_all_commands_and_all_options(bash_script: Path, tmp_path: Path) -> None:
     def complete(*words: str) -> set[str]:
         command = ["bash", "-c", BASH, "bash", str(bash_script), "echelon", *words]
-        return set(subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60).stdout.split())
+        return set(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600).stdout.split())
 
     assert complete("") == set(ENTRIES)
     for name in ENTRIES:

@@ -110,7 +110,7 @@ def test_all_mistakes_are_told_and_it_is_exit_code_2(tmp_path: Path) -> None:
 
 def test_scenarios_are_listed_with_what_they_show() -> None:
     rows = json.loads(echelon("scenarios", "--json").stdout)
-    assert [row["name"] for row in rows] == sorted(path.stem for path in (ROOT / "deploy" / "scenarios").iterdir())
+    assert [row["name"] for row in rows] == sorted(path.stem for path in (ROOT / "deploy" / "scenarios").glob("*.toml"))
     for row in rows:
         assert tomllib.loads(Path(row["path"]).read_text())["description"] == row["description"]
     lines = echelon("scenarios").stdout.splitlines()

@@ -15,7 +15,7 @@ from echelon.bridge.protocols.registry import make_host
 from echelon.cli.drive_bench import bench_facts, bench_lines
 from support.runs import echelon, kill_session, plan_of, start_echelon
 
-PATIENCE_S = 20.0
+PATIENCE_S = 600.0
 
 
 def own_bus() -> Bus:

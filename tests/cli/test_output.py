@@ -20,7 +20,7 @@ def run_without_reader(*arguments: str | Path, of: str = "stdout") -> int:
     streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | {of: write}
     try:
         return subprocess.run(
-            [sys.executable, "-m", "echelon", *map(str, arguments)], **streams, timeout=100, check=False
+            [sys.executable, "-m", "echelon", *map(str, arguments)], **streams, timeout=600, check=False
         ).returncode
     finally:
         os.close(write)
@@ -55,7 +55,7 @@ def test_what_prints_until_it_is_stopped_ends_with_its_reader(tmp_path: Path) ->
 def test_a_full_disk_is_said_and_is_no_success(arguments: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "echelon", *arguments], stdout=full, stderr=PIPE, text=True, timeout=100, check=False
+            [sys.executable, "-m", "echelon", *arguments], stdout=full, stderr=PIPE, text=True, timeout=600, check=False
         )
     assert done.returncode == 3
     assert done.stderr == "echelon: standard output: No space left on device\n"
@@ -67,7 +67,7 @@ def test_an_encoding_that_lacks_characters_is_no_failure(encoding: str) -> None:
         [sys.executable, "-m", "echelon", "analyse", "lab"],
         env=os.environ | {"PYTHONIOENCODING": encoding},
         stdout=PIPE,
-        timeout=200,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0

@@ -85,6 +85,7 @@ def test_blackouts_after_the_run_are_a_mistake():
         blackout(near_formation([], duration=6.0), Channel.STATE, 7_000_000_000, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", [Channel.STATE, Channel.COMMAND])
 def test_holding_bears_the_same_delay_by_both_ways_to_make_the_map(channel):
     plan = time_driven(near_formation([]))
@@ -96,6 +97,7 @@ def test_holding_bears_the_same_delay_by_both_ways_to_make_the_map(channel):
     assert others
 
 
+@pytest.mark.slow
 def test_predict_carries_lab_through_five_times_the_delay_that_hold_bears():
     plan = shipped("lab")
     hold = largest_extra_delay(time_driven(plan), Channel.STATE).seconds

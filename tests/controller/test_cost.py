@@ -21,6 +21,7 @@ def of(cost: Cost | None) -> np.ndarray:
     return np.array([block.value for block in cost.blocks])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timing", ["event_driven", "time_driven"])
 @pytest.mark.parametrize("links", [
     [{"loss": 0.1}],
@@ -39,6 +40,7 @@ def test_cost_is_the_mean_of_runs(links, timing):
     assert (error < 0.0125 * ise.mean(axis=0)).all()
 
 
+@pytest.mark.slow
 def test_cost_without_loss_is_that_of_the_run():
     plan = near_formation([])
     (ise,) = run_many(plan, [1]).blocks["ise"]

@@ -118,6 +118,7 @@ def test_sampled_loop_tends_to_the_continuous_one(lead):
     np.testing.assert_allclose(order, 2 if lead else 1, atol=0.15)
 
 
+@pytest.mark.slow
 def test_a_constant_push_leaves_no_error_where_the_linear_law_keeps_one():
     w = np.array([0.3, -0.1])
     for lead in (0.0, 0.5):
@@ -138,6 +139,7 @@ def test_beyond_its_limit_a_push_leaves_an_error_and_the_integral_does_not_grow(
     np.testing.assert_allclose(central.states[-1] * 0.4, 0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("k1", "k2", "k_i"), [(1.0, 1.2, 0.4), (0.5, 1.0, 0.45), (2.0, 1.0, 0.3), (1.0, 1.0, 0.9)])
 @pytest.mark.parametrize("lead", [0.0, 0.5])
 def test_runs_grow_and_decay_as_the_spectral_radius_says(k1, k2, k_i, lead):

@@ -26,6 +26,7 @@ def radius(plan: Plan, late: Edges, extra_ns: int) -> float:
     return spectral_radius(LinearRun(later(plan, late, extra_ns)).map())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_with_several_periods_no_delay_up_to_the_largest_is_unstable_and_the_next_is(seed):
     """Every fourth tick is tried with the map, and those at the edge; time-driven, groups with periods of 20, 40 and 80 ms."""
@@ -73,6 +74,7 @@ def test_a_delay_just_before_an_instant_may_be_worse_than_one_at_it():
     assert radius(plan, late, 189 * MS) > 1 > radius(plan, late, 190 * MS)
 
 
+@pytest.mark.slow
 def test_long_delays_have_an_answer():
     """In ticks of 1 ms the delay is more than 700: the truth is that of continuous time, less the hold."""
     for lead, expected in ((0.5, 711), (0.0, 710)):
@@ -91,6 +93,7 @@ def test_near_its_edge_a_loop_bears_no_tick_more():
     assert (found.ticks, found.ends) == (0, "unstable")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("T", [1.9, 0.1, 0.012])
 def test_where_the_criterion_is_not_valid_delays_are_tried_and_that_is_said(T, monkeypatch):
     plan = time_driven(single(T))
@@ -101,6 +104,7 @@ def test_where_the_criterion_is_not_valid_delays_are_tried_and_that_is_said(T, m
     assert not by_criterion.tried
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lead", [0.0, 0.5])
 def test_margins_of_layers_tend_to_those_of_continuous_time(lead):
     """Coupled blocks: all states late by τ is ë = -(K_1 e + (K_2 + K̄) ė)(t - τ) of the whole, whose margin comes from the
@@ -137,6 +141,7 @@ def test_margins_of_uncoupled_layers_tend_to_those_of_their_blocks(layer):
                 assert found.limits == (("g1", "g2", "g3") if layer == "intra" else ("inter",))
 
 
+@pytest.mark.slow
 def test_what_limits_a_delay_is_the_fastest_block_of_its_loop():
     plan = plan_of("multi")
     limits = {one.name: largest_extra_delay(plan, one.edges).limits for one in link_sets(plan) if one.kind == "class"}

@@ -93,6 +93,7 @@ def test_radius_is_that_of_the_map_on_histories(tree, seed, delay_ticks, T):
     assert radius_of(plan, delay_ticks) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 @SETTINGS
 @given(trees(max_depth=3, max_robots=6), SEEDS, st.sampled_from([0.02, 0.1]))
 def test_parts_that_do_not_act_on_each_other_change_nothing(tree, seed, T):
@@ -123,6 +124,7 @@ def test_boundary_is_that_of_the_loop_run_tick_by_tick(seed):
         assert found == pytest.approx(np.log(radius), rel=0.15)
 
 
+@pytest.mark.slow
 def test_paper_bears_six_milliseconds_and_not_seven():
     _, plan = load(PAPER, ["periods={acceleration=0.001, torque=0.0001}", "law.lead=0.5"])
     assert radius_of(plan, 6) < 1 < radius_of(plan, 7)
@@ -149,6 +151,7 @@ def test_margin_puts_a_root_on_the_axis(K1, K2):
     assert np.abs(axis**2 + (K2 * axis + K1) * np.exp(-0.9 * tau * axis)).min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("k1", "k2"), [(1.0, 1.0), (2.0, 0.8)])
 def test_boundary_tends_to_the_continuous_margin(k1, k2):
     """A command that is held for T is T/2 older on average, so without lead the largest delay is τ* - T/2, up to a tick.  With
@@ -259,6 +262,7 @@ def check_points(plan: Plan, monkeypatch: pytest.MonkeyPatch, rel: float = 0.15)
     return radius
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("seed", range(2))
 def test_points_grow_and_decay_as_predicted_around_the_margin_of_each_channel(channel, seed, monkeypatch):
@@ -271,6 +275,7 @@ def test_points_grow_and_decay_as_predicted_around_the_margin_of_each_channel(ch
         assert (radius < 1) == (k <= last)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_every_link_may_have_a_delay_of_its_own(seed, monkeypatch):
     """Delays of any length, on and between ticks, beside a group with a shorter period."""
@@ -291,6 +296,7 @@ def test_every_link_may_have_a_delay_of_its_own(seed, monkeypatch):
     check_points(with_links(plan, delays.tolist()), monkeypatch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_margin_with_periods_of_different_length_is_where_points_begin_to_grow(channel, monkeypatch):
     random = np.random.default_rng(7)
@@ -330,6 +336,7 @@ def test_every_delay_up_to_the_margin_is_stable_and_the_next_is_not(channel, see
         assert (radius_of(plan, k, channel) < 1) == (k <= last)
 
 
+@pytest.mark.slow
 def test_integral_action_in_the_tree_is_predicted_as_the_engine_runs_it(monkeypatch):
     random = np.random.default_rng(3)
     law = random_epsilon(TREE, random) | {"lead": 0.5, "use": "integral", "parameters": {"k_i": 0.2, "limit": 1e60}}
@@ -343,6 +350,7 @@ def test_integral_action_in_the_tree_is_predicted_as_the_engine_runs_it(monkeypa
         check_points(later(plan, Channel.COMMAND, k * plan.root.period_ns), monkeypatch)
 
 
+@pytest.mark.slow
 def test_where_the_torque_path_is_closed_a_late_torque_is_a_late_command():
     mirrored = shipped("lab")
     closed = shipped("lab", 'can={path="closed", watchdog=5.0}')

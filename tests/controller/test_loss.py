@@ -99,6 +99,7 @@ def random_plan(tree: Sequence[object], seed: int, **tables: object) -> Plan:
     return at_rest(with_random_gains(plan_of(table), random, coupling=0.2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timing", ["time_driven", "event_driven"])
 @pytest.mark.parametrize(("tree", "broadcast", "ticks"), [
     (((None,), None), False, 0),

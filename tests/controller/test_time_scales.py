@@ -77,6 +77,7 @@ def check_first(found: float, roots: np.ndarray, abscissa) -> None:
         assert found == inf
 
 
+@pytest.mark.slow
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(
     st.sampled_from(TREES),

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from echelon.messages import Channel, Message
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.plan.punctuality import with_punctuality
 from echelon.sim.engines.in_process import Engine
 from support.points import time_driven

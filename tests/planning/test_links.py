@@ -8,7 +8,8 @@ import pytest
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.delay_tables import LOST, Bursts, ClockPlan, DelayTable, DelayTrace
-from echelon.plan.plan import LinkPlan, Plan
+from echelon.plan.link_plan import LinkPlan
+from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.sim.parts.loading import load, parse
 from support.runs import SCENARIOS

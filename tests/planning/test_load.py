@@ -482,6 +482,7 @@ def test_a_tree_too_deep_is_refused():
 # Parts
 
 
+@pytest.mark.slow
 @given(st.lists(st.text() | st.integers(0, 99), max_size=4))
 def test_keys_are_one_line(keys):
     assert len(one_line(key_text(keys)).splitlines()) <= 1

@@ -63,6 +63,7 @@ def test_a_run_with_hyphens_in_all_names(engine: str, tmp_path: Path) -> None:
     assert " can-b " in (out / "can.log").read_text()
 
 
+@pytest.mark.slow
 def test_the_default_folder_begins_with_the_name_of_the_scenario(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text(TEXT)
     done = echelon("run", "x.toml", "--engine", "inprocess", "--quiet", "--no-report", cwd=tmp_path)

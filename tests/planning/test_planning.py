@@ -155,7 +155,10 @@ def test_what_cannot_be_steered_is_refused():
 
 def test_number_of_robots():
     assert len(plan_of(grouped(100, MAX_ROBOTS - 100)).robots) == MAX_ROBOTS
-    assert refusal(grouped(100, MAX_ROBOTS - 99)) == "formation: 128 robots, but a bus has identifiers for 127"
+    why = "formation: 128 robots, but a bus has identifiers for 127; with can.enabled = false there may be 1000"
+    assert refusal(grouped(100, MAX_ROBOTS - 99)) == why
+    assert len(plan_of(grouped(100, 100), "can.enabled=false").robots) == 200
+    assert refusal(grouped(500, 501), "can.enabled=false") == "formation: 1001 robots: must be at most 1000"
 
 
 def test_robots_that_start_in_one_place_are_refused():
@@ -475,6 +478,7 @@ def matches_by_force(pattern: str, path: str) -> bool:
     return False
 
 
+@pytest.mark.slow
 @settings(max_examples=1500)
 @given(
     st.lists(st.sampled_from(["a", "b", "*", "**"]), min_size=1, max_size=5).map("/".join),

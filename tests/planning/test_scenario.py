@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-import echelon.scenario.tables
 from echelon import shipped
 from echelon.plan.plan import Plan
 from echelon.planning.loading import ScenarioError, effective_toml
 from echelon.plugins import PartError
 from echelon.scenario.part_fields import PartContext
 from echelon.scenario.tables import RobotTable, Scenario, Shape
+from echelon.scenario.values import Table
 from echelon.sim.parts.loading import REGISTRY, load, parse
 
 SCENARIOS = sorted(shipped.FOLDER.glob("*.toml"))
@@ -115,10 +115,9 @@ def test_any_description_reads_back(text):
     assert parse(effective_toml(changed), "t.toml")[0] == changed
 
 
-def models() -> list[type[BaseModel]]:
+def models(above: type[Table] = Table) -> list[type[Table]]:
     """Returns all tables of a scenario."""
-    found = [value for value in vars(echelon.scenario.tables).values() if isinstance(value, type)]
-    return [value for value in found if issubclass(value, BaseModel) and value is not BaseModel]
+    return [model for child in above.__subclasses__() for model in (child, *models(child))]
 
 
 @pytest.mark.parametrize("model", models())

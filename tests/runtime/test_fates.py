@@ -25,7 +25,7 @@ from echelon.plan.delay_tables import (
     looked_up_z,
     merged,
 )
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.planning.delays import make_table
 from echelon.runtime.fates import BLOCK, CHAIN, Fates, draws, normal_table, words
 from echelon.scenario.link_tables import Gamma, Normal, Pareto, Uniform
@@ -80,6 +80,7 @@ def ks(sample_s: object, distribution: object) -> float:
     return float(max((steps[1:] - F).max(), (F - steps[:-1]).max()) * np.sqrt(sample.size))
 
 
+@pytest.mark.slow
 @each_distribution
 def test_delays_have_their_distribution(name: str) -> None:
     delay, distribution = DISTRIBUTIONS[name]
@@ -92,6 +93,7 @@ def test_delays_have_their_distribution(name: str) -> None:
     assert np.array_equal(fates(plan).block(3)[:, 0] * 1e-9, delays[3 * BLOCK : 4 * BLOCK])
 
 
+@pytest.mark.slow
 @each_distribution
 def test_correlated_delays_have_the_same_distribution(name: str) -> None:
     """z has a standard normal distribution at every message; the delay is a function of z."""
@@ -182,6 +184,7 @@ def test_the_normal_table_is_exact() -> None:
     assert np.array_equal(normal_table(), -normal_table()[::-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.3, 0.9, 0.999])
 def test_correlation_is_that_of_a_gaussian_copula(rho: float) -> None:
     """What is left of z after ρ z of the message before is independent and normal, and z itself is normal at all times."""
@@ -332,6 +335,7 @@ def test_losses_of_messages_are_the_same_for_all_receivers_and_delays_are_not() 
         assert not np.array_equal(one == LOST, apart == LOST)
 
 
+@pytest.mark.slow
 def test_duplicates_come_as_often_as_wanted_with_delays_of_their_own() -> None:
     plan = link(DISTRIBUTIONS["gamma"][0], loss=0.5, duplicates=0.3)
     made = fates(plan)

@@ -5,12 +5,13 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from echelon.messages import Channel
+from echelon.messages import Channel, Message
 from echelon.plan.delay_tables import LOST, Bursts, DelayTrace
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.planning.delays import make_table
 from echelon.runtime.ages import AgeCounts
 from echelon.runtime.fates import Fates, draws, link_key
+from echelon.runtime.link import Link
 from echelon.scenario.link_tables import Gamma, Pareto
 from support.links import PunctualLink
 
@@ -298,3 +299,20 @@ def test_ages_and_holds():
     assert counts.age_mean_ns == pytest.approx((1 + 1 + 2 + 3 + 1) / 5 * MS)
     assert counts.age_max_ns == 3 * MS
     assert made().counts().age_mean_ns == 0.0
+
+
+def test_on_a_link_that_keeps_the_order_a_message_waits_for_those_before_it_whenever_they_come():
+    plan = replace(UNIFORM, delay_min_ns=0, delay_max_ns=20 * MS, loss=0.0, fifo=True)
+    messages = {
+        number: Message(plan.channel, plan.source, number, plan.first_ns + number * plan.period_ns, np.ones(1))
+        for number in range(40)
+    }
+    time_ns, until_ns = plan.first_ns + 39 * plan.period_ns, 10**9
+    in_order, in_parts = (Link(plan, 1, "g1/r1", "g1") for _ in range(2))
+    assert in_order.take_up(time_ns, until_ns, dict(messages), -1)
+    some = {number: message for number, message in messages.items() if number % 3}
+    assert not in_parts.take_up(time_ns, until_ns, dict(some), -1)
+    assert in_parts.take_up(time_ns, until_ns, dict(messages), -1)
+    arrivals = [in_order.arrival(number) for number in messages]
+    assert arrivals == sorted(arrivals)
+    assert [in_parts.arrival(number) for number in messages] == arrivals

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from echelon.messages import NULL, Channel, Message
 from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.delay_tables import ClockPlan
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.role import Acts, Input, Stage
 from echelon.runtime.arrivals import RECORD
 from echelon.runtime.mailbox import Mailbox
@@ -106,9 +106,9 @@ def test_a_stage_gets_the_same_messages_in_any_order_of_arrival(links, seed, sil
             else:
                 assert message is not None
                 assert (message.source, message.sequence) == (link.source, expected)
-    assert mailbox.unexpected == 0
 
 
+@pytest.mark.slow
 @given(links_strategy, seeds)
 def test_what_is_missing_are_the_messages_that_have_arrived(links, seed):
     """A link waits while it lacks a message that has arrived by now; those on their way it does not wait for."""
@@ -126,6 +126,7 @@ def test_what_is_missing_are_the_messages_that_have_arrived(links, seed):
         mailbox.take(0, time_ns)
 
 
+@pytest.mark.slow
 @given(links_strategy, seeds, st.randoms(use_true_random=False))
 def test_on_a_wall_clock_the_newest_that_came_is_used(links, seed, luck):
     """Some messages come late, some never.  In use is the newest that has come and has arrived by the rules of the link."""
@@ -227,7 +228,6 @@ def test_arrivals_are_noted_once_and_only_of_messages_that_are_not_lost():
     for link in links:
         for time_ns in (3, 4):
             mailbox.receive(message_of(link, 0), time_ns)
-    mailbox.receive(Message(Channel.COMMAND, 0, 0, 0, np.ones(1)), 5)
     assert list(RECORD.iter_unpack(mailbox.arrivals)) == [(1, 0, 0, 3)]
     silent = mailbox_of(links, kind=WallMailbox)
     silent.receive(message_of(links[1], 0), 3)
@@ -288,15 +288,6 @@ def test_stages_share_an_input():
                 (heard,) = mailbox.take(number, tick * PERIOD)
                 assert heard is not None
                 assert heard.sequence == tick
-
-
-def test_messages_of_no_link_are_counted():
-    link = LinkPlan(0, RECEIVER, Channel.STATE, PERIOD)
-    mailbox = mailbox_of([link])
-    mailbox.deliver(Message(Channel.COMMAND, 0, 0, 0, np.ones(1)))
-    mailbox.deliver(Message(Channel.STATE, 5, 0, 0, np.ones(1)))
-    assert mailbox.unexpected == 2
-    assert held_messages(mailbox) == 0
 
 
 @given(links_strategy, seeds)

@@ -16,7 +16,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.arrivals import END, FILE, RECORD, ArrivalFile
 from echelon.runtime.mailbox import Mailbox
 from echelon.runtime.paced import PacedRunner
-from echelon.runtime.wire import encode
+from echelon.runtime.wire import data_key, encode
 from echelon.sim.engines.in_process import make_role
 from echelon.sim.recording.arrivals import read_arrivals
 from support.recordings import messages_of
@@ -90,9 +90,10 @@ def run_slowly(
     """Runs a role in a slow process, and notes its arrivals; returns its acts and its runner."""
     clock, coming = SlowClock(luck, stall_ns), coming_to(plan, index, luck)
     acts: list[Act] = []
-    takes: list[Callable[[bytes], None]] = []
+    takes: dict[str, Callable[[bytes], None]] = {}
+    paths = [one.path for one in plan.all_roles]
     session: Any = SimpleNamespace(
-        subscribe=lambda keys, receive: takes.append(receive),
+        subscribe=takes.__setitem__,
         publisher=lambda key: SimpleNamespace(put=lambda payload: None),
     )
 
@@ -102,7 +103,8 @@ def run_slowly(
             clock.now_ns = max(clock.now_ns, coming[0][0])
             for _ in range(luck.choice([1, 1, 1, 5])):
                 if coming and coming[0][0] <= clock.now_ns:
-                    takes[0](encode(coming.pop(0)[1]))
+                    message = coming.pop(0)[1]
+                    takes[data_key("test", paths[message.source], message.channel)](encode(message))
         else:
             clock.now_ns = max(clock.now_ns, until_ns)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -19,6 +19,7 @@ import echelon.runtime.paced
 from echelon.messages import Channel, Heard, Message
 from echelon.plan.plan import Plan
 from echelon.role import Role, Stage
+from echelon.runtime.admission import AGAIN, MISSHAPEN, OF_ANOTHER
 from echelon.runtime.lockstep import MAX_BATCHES, LockstepRunner
 from echelon.runtime.mailbox import MAX_AHEAD
 from echelon.runtime.paced import PacedRunner
@@ -26,10 +27,10 @@ from echelon.runtime.session import Receive
 from echelon.runtime.wire import data_key, decode, encode, split
 from echelon.sim.engines.in_process import Engine, make_role
 from echelon.sim.results.trace import TraceBuilder
-from support.runs import plan_of, trace_of
+from support.runs import plan_of, trace_of, until
 
 RUN = "test"
-TIMEOUT_S = 20.0
+TIMEOUT_S = 600.0
 LINKS = 'links=[{channel="state",delay={min=0.0,max=0.003},loss=0.1},{channel="command",delay=0.0012,loss=0.05}]'
 LATE = 'links=[{channel="state",delay=5.0},{channel="command",delay=5.0}]'
 LOST = 'links=[{channel="command",receiver="g1/*",loss=1.0},{channel="group_state",source="g2",loss=1.0}]'
@@ -47,9 +48,8 @@ class Network:
     def session(self, name: str) -> Any:
         """Returns the session of one process."""
 
-        def subscribe(keys: Sequence[str], receive: Receive) -> None:
-            for key in keys:
-                self.receivers.setdefault(key, []).append((name, receive))
+        def subscribe(key: str, receive: Receive) -> None:
+            self.receivers.setdefault(key, []).append((name, receive))
 
         def publisher(key: str) -> Any:
             def put(payload: bytes) -> None:
@@ -87,14 +87,15 @@ class Member:
         self.data_gate.set()
         self.watch_gate.set()
         self.at_gate = threading.Event()
-        self.receive: Receive = lambda payload: None
+        self.doors: dict[str, Receive] = {}
+        self._paths = [one.path for one in plan.all_roles]
         self.failure: BaseException | None = None
         self.waits: list[tuple[int, list[int]]] = []
         self.on_wait: Callable[[], None] = lambda: None
         self.waiting = threading.Event()
 
-        def subscribe(keys: Sequence[str], receive: Receive) -> None:
-            self.receive = receive
+        def subscribe(key: str, receive: Receive) -> None:
+            self.doors[key] = receive
 
         def publisher(key: str) -> Any:
             gate, out = (self.watch_gate, self.batches) if "@watch" in key else (self.data_gate, self.said)
@@ -124,6 +125,24 @@ class Member:
         finally:
             self.runner.finish()
 
+    def receive(self, payload: bytes) -> None:
+        """Gives the runner a message, under the key of its source and channel."""
+        message = decode(payload)
+        self.doors[data_key(RUN, self._paths[message.source], message.channel)](payload)
+
+    def near(self, payloads: Sequence[bytes]) -> Iterator[bytes]:
+        """Yields messages when a source in the same lockstep sends them: none over `MAX_AHEAD` periods ahead of the runner."""
+        for payload in payloads:
+            message = decode(payload)
+            first_ns = message.time_ns - MAX_AHEAD * (message.time_ns // message.sequence if message.sequence else 0)
+            assert until(lambda at=first_ns: self.runner._now_ns() >= at or not self.thread.is_alive(), TIMEOUT_S)  # type: ignore[misc]
+            yield payload
+
+    def feed(self, payloads: Sequence[bytes]) -> None:
+        """Gives the runner messages as a source in the same lockstep does."""
+        for payload in self.near(payloads):
+            self.receive(payload)
+
     def join(self) -> None:
         """Waits for the end of the run."""
         self.thread.join(TIMEOUT_S)
@@ -142,9 +161,9 @@ def plan_and_digest(name: str, *overrides: str) -> tuple[Plan, str]:
 
 
 @cache
-def story(*overrides: str) -> tuple[Plan, list[Message]]:
-    """Returns the paper's plan and all messages of its run in one process."""
-    plan, messages = plan_of("paper", "duration=0.4", *overrides), list[Message]()
+def story(*overrides: str, name: str = "paper") -> tuple[Plan, list[Message]]:
+    """Returns a plan, the paper's by default, and all messages of its run in one process."""
+    plan, messages = plan_of(name, "duration=0.4", *overrides), list[Message]()
     Engine(plan, messages.append).run()
     return plan, messages
 
@@ -191,7 +210,7 @@ def test_lockstep_gives_the_trace_of_the_engine(wanted: tuple[str, ...], seed: i
             for payload in split(batch):
                 builder.add(decode(payload))
     assert builder.build().digest() == digest
-    assert not any(runner.counts.refused or runner.mailbox.unexpected for runner in runners)
+    assert not any(runner.refusals.total for runner in runners)
 
 
 def test_a_stall_names_the_members_that_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,44 +249,66 @@ def test_garbage_is_counted_and_dropped() -> None:
     member = Member(plan, make_role(plan, robot.index))
     member.thread.start()
     noise = random.Random(1)
+    (door,) = member.doors.values()
     shapeless = 0
-    for number, command in enumerate(commands):
+    for number, command in enumerate(member.near(commands)):
         other_version = bytes([command[0] + 1]) + command[1:]
         for garbage in (b"", noise.randbytes(noise.randint(1, 90)), command[:-1], other_version):
-            member.receive(garbage)
-        member.receive(encode(Message(Channel.COMMAND, 999, number, 0, decode(command).values)))
+            door(garbage)
+        door(encode(Message(Channel.COMMAND, 999, number, 0, decode(command).values)))
         if (message := decode(command)).values.size:
             for misshapen in (message.values[:-1], np.append(message.values, 0.0)):
-                member.receive(encode(message._replace(values=misshapen)))
+                door(encode(message._replace(values=misshapen)))
                 shapeless += 1
-        member.receive(command)
-        member.receive(command)  # the second copy changes nothing
+        door(command)
+        door(command)  # the second copy changes nothing
     member.join()
     assert member.failure is None
-    assert sum(member.runner.counts.refused.values()) == 5 * len(commands) + shapeless
-    assert member.runner.mailbox.unexpected == len(commands)
-    assert member.runner.mailbox.misshapen == shapeless > 0
+    refused = member.runner.refusals.by_source()[plan.all_roles[robot.parent].name]
+    assert sum(refused.values()) == member.runner.refusals.total == 6 * len(commands) + shapeless
+    assert refused[OF_ANOTHER] == refused[AGAIN] == len(commands)
+    assert refused[MISSHAPEN] == shapeless > 0
     assert member.said == of(messages, robot.index, Channel.STATE)
 
 
 def test_an_observer_that_reads_nothing_blocks_the_role_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(echelon.runtime.lockstep, "BATCH_BYTES", 1000)
+    monkeypatch.setattr(echelon.runtime.lockstep, "BATCH_BYTES", 300)
     plan, messages = story()
     robot = plan.robots[0]
     states = of(messages, robot.index, Channel.STATE)
     member = Member(plan, make_role(plan, robot.index))
     member.watch_gate.clear()
     member.thread.start()
-    for command in of(messages, robot.parent, Channel.COMMAND):
+    commands = of(messages, robot.parent, Channel.COMMAND)
+    for command in commands[:MAX_AHEAD]:
         member.receive(command)  # returns at once
     assert member.at_gate.wait(TIMEOUT_S)
-    per_batch = 1 + 1000 // len(states[0])
-    assert len(member.said) <= (MAX_BATCHES + 1) * per_batch
+    per_batch = 1 + 300 // len(states[0])
+    assert len(member.said) <= (MAX_BATCHES + 1) * per_batch < MAX_AHEAD
     assert member.batches == []
     member.watch_gate.set()
+    member.feed(commands[MAX_AHEAD:])
     member.join()
     assert member.said == states
     assert member.watched() == states
+
+
+@pytest.mark.parametrize("name", ["paper", "lab"])
+def test_what_a_process_that_is_killed_has_not_sent_spans_less_than_a_fifth_of_a_second(name: str) -> None:
+    plan, messages = story(name=name)
+    robot = plan.robots[0]
+    member = Member(plan, make_role(plan, robot.index))
+    member.watch_gate.clear()
+    member.thread.start()
+    feeder = threading.Thread(target=member.feed, args=(of(messages, robot.parent, Channel.COMMAND),), daemon=True)
+    feeder.start()
+    assert until(lambda: len(member.runner._copies.batches) == MAX_BATCHES, TIMEOUT_S)  # type: ignore[union-attr]
+    assert member.batches == []
+    assert (len(member.said) + 1) * robot.period_ns < 200_000_000
+    member.watch_gate.set()
+    feeder.join()
+    member.join()
+    assert member.watched() == of(messages, robot.index, Channel.STATE)
 
 
 def test_the_last_batch_is_sent_though_the_handler_ends_the_run() -> None:
@@ -277,8 +318,7 @@ def test_the_last_batch_is_sent_though_the_handler_ends_the_run() -> None:
         member = Member(plan, make_role(plan, robot.index))
         member.runner.finish = lambda: None  # type: ignore[method-assign]  # lockstep alone has to do it
         member.thread.start()
-        for command in of(messages, robot.parent, Channel.COMMAND):
-            member.receive(command)
+        member.feed(of(messages, robot.parent, Channel.COMMAND))
         member.join()
         assert member.watched() == of(messages, robot.index, Channel.STATE)
 
@@ -291,8 +331,10 @@ def test_receiving_never_waits_for_a_put_of_the_main_thread() -> None:
     member.thread.start()
     assert member.at_gate.wait(TIMEOUT_S)  # the main thread puts the first state, and moves the role
 
+    commands = of(messages, robot.parent, Channel.COMMAND)
+
     def feed() -> None:
-        for command in of(messages, robot.parent, Channel.COMMAND):
+        for command in commands[:MAX_AHEAD]:
             member.receive(command)
 
     feeder = threading.Thread(target=feed, daemon=True)
@@ -300,6 +342,7 @@ def test_receiving_never_waits_for_a_put_of_the_main_thread() -> None:
     feeder.join(TIMEOUT_S)
     assert not feeder.is_alive()
     member.data_gate.set()
+    member.feed(commands[MAX_AHEAD:])
     member.join()
     assert member.said == of(messages, robot.index, Channel.STATE)
 
@@ -315,8 +358,7 @@ def test_a_role_whose_links_lose_everything_still_waits_for_its_sources(
     assert member.waiting.wait(TIMEOUT_S)
     assert MAX_AHEAD <= len(member.said) <= MAX_AHEAD + 2
     assert member.waits[0][1] == [robot.parent]
-    for command in of(messages, robot.parent, Channel.COMMAND):
-        member.receive(command)
+    member.feed(of(messages, robot.parent, Channel.COMMAND))
     member.join()
     assert member.said == of(messages, robot.index, Channel.STATE)
 
@@ -336,8 +378,7 @@ def test_an_exception_in_a_stage_reaches_the_caller(at: int) -> None:
     stub: Any = SimpleNamespace(index=role.index, stages=(replace(say, run=spoiled), move))
     member = Member(plan, stub)
     member.thread.start()
-    for command in of(messages, robot.parent, Channel.COMMAND):
-        member.receive(command)
+    member.feed(of(messages, robot.parent, Channel.COMMAND))
     member.join()
     assert isinstance(member.failure, ArithmeticError)
     assert member.watched() == member.said == of(messages, robot.index, Channel.STATE)[:at]
@@ -458,8 +499,8 @@ def test_keys_of_the_inputs_of_a_member() -> None:
     plan = story()[0]
     heard: list[str] = []
     session: Any = SimpleNamespace(
-        subscribe=lambda keys, receive: heard.extend(keys), publisher=lambda key: SimpleNamespace(put=lambda data: None)
+        subscribe=lambda key, receive: heard.append(key), publisher=lambda key: SimpleNamespace(put=lambda data: None)
     )
     LockstepRunner(make_role(plan, plan.nodes[1].index), plan, session, RUN, watched=False)
     g1 = [data_key(RUN, plan.formation[child].path, Channel.STATE) for child in plan.nodes[1].children]
-    assert heard == sorted([*g1, data_key(RUN, "", Channel.REFERENCE)])
+    assert sorted(heard) == sorted([*g1, data_key(RUN, "", Channel.REFERENCE)])

@@ -15,9 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from echelon.runtime.session import Inbox, Session, loopback_endpoints
+from echelon.runtime.inbox import Inbox
+from echelon.runtime.session import Session, loopback_endpoints
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 600.0
 _spawn = multiprocessing.get_context("spawn")
 Body = Callable[[str, Connection], None]
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
+from echelon.bridge.can.canlog import EPOCH_NS
 from echelon.cli import main
 from echelon.cli.showing import show_growing
-from echelon.sim.interruption import interruption
+from echelon.sim.interruption import SIGNALS, Raises, interruption
 from echelon.sim.run_folder import open_run
 from echelon.sim.run_state import goes_on, read_state
 from support.runs import echelon, plan_of, start_echelon, summary_of, until
@@ -33,13 +34,13 @@ def in_process(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any]
     return ran("inprocess", folder), folder
 
 
-def test_a_diverged_run_stops_at_the_first_state_that_is_not_finite(in_process: tuple[dict[str, Any], Path]) -> None:
+def test_a_diverged_run_stops_at_the_first_state_beyond_all_bounds(in_process: tuple[dict[str, Any], Path]) -> None:
     summary, folder = in_process
     checks = {check["name"]: check for check in summary["verdict"]["checks"]}
     assert checks["whole"]["outcome"] == checks["finite"]["outcome"] == "failed"
     assert checks["whole"]["text"] == f"the run was stopped at {summary['simulated']:g} s of 2 s"
     assert summary["simulated"] < 1
-    assert f"is not finite from {summary['simulated']:g} s on" in summary["run"]["stopped"]
+    assert f"is beyond all bounds from {summary['simulated']:g} s on" in summary["run"]["stopped"]
     assert summary["run"]["failure"] is None
     assert open_run(folder).trace.digest() == summary["trace_digest"]
 
@@ -66,7 +67,9 @@ def test_the_bus_of_a_stopped_run_is_judged_up_to_the_stop_and_the_cause_is_told
     stop = f"up to {summary['simulated']:g} s, where the run was stopped"
     assert checks["referee"]["text"].endswith(stop)
     assert summary["can"]["referee"]["until"] == summary["simulated"]
-    times_s = [float(line.partition(")")[0][1:]) for line in (folder / "can.log").read_text().splitlines()]
+    times_s = [
+        float(line.partition(")")[0][1:]) - EPOCH_NS / 1e9 for line in (folder / "can.log").read_text().splitlines()
+    ]
     later = sum(time_s > summary["simulated"] for time_s in times_s)
     assert summary["can"]["referee"]["later"] == later == len(times_s) - summary["can"]["referee"]["frames"] > 0
     assert f"can.log and the numbers of the buses include {later} later frames, which are not judged" in done.stdout
@@ -88,9 +91,9 @@ def interrupted(folder: Path, scenario: str, *options: str) -> dict[str, Any]:
     run = ("--engine", "inprocess", "--set", "duration=1000", *options)
     command = start_echelon("run", scenario, *run, *CLOSED, "--out", folder)
     log = folder / "can.log"
-    assert until(lambda: log.exists() and log.stat().st_size > 400_000, 60), command.communicate(timeout=5)
+    assert until(lambda: log.exists() and log.stat().st_size > 400_000), command.communicate(timeout=5)
     command.send_signal(signal.SIGINT)
-    _, err = command.communicate(timeout=60)
+    _, err = command.communicate(timeout=600)
     assert command.returncode == 3
     assert err.splitlines()[-1] == "echelon: interrupted"
     return summary_of(folder)
@@ -107,16 +110,33 @@ def test_the_frames_of_our_own_stop_are_no_findings(scenario: str, tmp_path: Pat
     assert main(["referee", str(tmp_path / "run")]) == 0  # a second judgement has no findings, either
 
 
-def test_an_interruption_is_noted_first_and_raised_the_second_time() -> None:
+def test_an_interruption_is_noted_first_and_raised_the_second_time(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
-    with interruption(lambda: calls.append(1)) as noted:
+    before = [signal.getsignal(number) for number in SIGNALS]
+    with interruption() as noted, noted.during(Raises.SECOND, lambda: calls.append(1)):
         assert not noted.asked
         signal.raise_signal(signal.SIGINT)
         assert (noted.asked, calls) == (True, [1])
+        signal.raise_signal(signal.SIGTERM)  # the same request: a wrapper passes on what its group has got
+        assert (noted.hurried, calls) == (False, [1, 1])
+        monkeypatch.setattr("echelon.sim.interruption.SAME_S", 0.0)
         with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGHUP)
+        with noted.during(Raises.NONE):
             signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert noted.hurried
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+
+
+def test_a_signal_that_the_caller_ignores_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interruption() as noted:
+            signal.raise_signal(signal.SIGHUP)
+        assert not noted.asked
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_run_says_where_its_buses_are_and_can_be_looked_at_while_it_goes_on(
@@ -126,7 +146,7 @@ def test_a_run_says_where_its_buses_are_and_can_be_looked_at_while_it_goes_on(
     command = start_echelon("run", "lab", "--set", "duration=12", "--can", "auto", *CLOSED, "--out", folder)
     try:
         log = folder / "can.log"
-        assert until(lambda: log.exists() and log.stat().st_size > 100_000, 60), command.communicate(timeout=5)
+        assert until(lambda: log.exists() and log.stat().st_size > 100_000), command.communicate(timeout=5)
         assert goes_on(folder)
         state = read_state(folder)
         assert state is not None
@@ -146,7 +166,7 @@ def test_a_run_says_where_its_buses_are_and_can_be_looked_at_while_it_goes_on(
         shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
         assert shown[-1]["frames"] > first["frames"]
         assert shown[-1]["kinds"] == {}
-        command.communicate(timeout=60)
+        command.communicate(timeout=600)
     finally:
         command.kill()
     assert not goes_on(folder)
@@ -156,7 +176,7 @@ def test_a_run_says_where_its_buses_are_and_can_be_looked_at_while_it_goes_on(
 def test_a_killed_run_does_not_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = start_echelon("run", "lab", "--engine", "inprocess", "--set", "duration=1000", *CLOSED, "--out", folder)
-    assert until(lambda: (folder / "can.log").exists(), 60), command.communicate(timeout=5)
+    assert until(lambda: (folder / "can.log").exists()), command.communicate(timeout=5)
     assert goes_on(folder)
     command.kill()
     command.wait()

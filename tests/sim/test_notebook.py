@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import nbformat
 import numpy as np
@@ -221,6 +222,15 @@ def test_mistakes_in_python_name_pythons_arguments(tmp_path: Path) -> None:
         assert "--" not in str(caught.value)
 
 
+def test_a_bus_of_hardware_must_be_asked_for(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"can": "socketcan:lo", "quiet": True}  # lo is a network interface, but no CAN bus
+    with pytest.raises(echelon.UserError, match=r"^can socketcan:lo: is hardware, .* give real_bus=True if"):
+        echelon.run("lab", {"duration": 0.1}, out=tmp_path / "refused", **options)
+    assert not (tmp_path / "refused").exists()
+    run = echelon.run("lab", {"duration": 0.1}, out=tmp_path / "asked", real_bus=True, **options)
+    assert "cannot open CAN bus socketcan:lo" in (run.failure or "")
+
+
 def test_errors_and_states_are_those_of_the_instant() -> None:
     simulation = echelon.Simulation("lab", {"duration": 0.2, "claims": []})
     simulation.run_until(0.1)
@@ -246,7 +256,7 @@ def test_a_script_without_a_main_guard_starts_processes(way: str, tmp_path: Path
         input=script.read_text() if way != "file" else None,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         cwd=tmp_path,
     )
     assert done.stderr == ""
@@ -255,7 +265,7 @@ def test_a_script_without_a_main_guard_starts_processes(way: str, tmp_path: Path
 
 def test_the_example_notebook_runs(tmp_path: Path) -> None:
     notebook = nbformat.read(ROOT / "examples" / "notebook.ipynb", as_version=4)
-    done = NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    done = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in done.cells if cell.cell_type == "code" for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]
     assert any("image/svg+xml" in output.get("data", {}) for output in outputs)

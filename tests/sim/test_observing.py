@@ -13,6 +13,7 @@ import pytest
 
 from echelon.errors import UsageError
 from echelon.messages import Channel, Message
+from echelon.runtime.admission import Refusals
 from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, encode, join, run_keys, watch_key
@@ -51,7 +52,8 @@ FROZEN = """
 import os, signal, sys
 from pathlib import Path
 from echelon.sim.observing import Ticket, observe
-for message in observe(Ticket.read(Path(sys.argv[1]))):
+from support.runs import plan_of
+for message in observe(Ticket.read(Path(sys.argv[1])), plan_of("lab", "duration=15.0")):
     print(message.time_ns, flush=True)
     os.kill(os.getpid(), signal.SIGSTOP)
 """
@@ -63,7 +65,8 @@ def test_a_run_ends_well_though_an_observer_stands_still(tmp_path: Path) -> None
     supervisor = Supervisor(plan, tmp_path, run=f"observed-{os.getpid()}", virtual=True, observe=True)
     assert supervisor.ticket is not None
     supervisor.ticket.write(tmp_path)
-    with Popen([sys.executable, "-c", FROZEN, str(tmp_path)], stdout=PIPE, text=True) as frozen:
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    with Popen([sys.executable, "-c", FROZEN, str(tmp_path)], stdout=PIPE, text=True, env=environment) as frozen:
         try:
             outcome = supervisor.run()
             assert frozen.stdout is not None
@@ -114,8 +117,10 @@ def test_what_observers_hear_is_what_was_recorded(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = start_echelon("run", "lab", "--set", "duration=2.0", *WALL, "--out", folder)
     assert opened(folder)
-    heard = list(observe(Ticket.read(folder), "g1/r1"))
+    refusals = Refusals()
+    heard = list(observe(Ticket.read(folder), plan_of("lab", "duration=2.0"), "g1/r1", refusals))
     command.communicate()
+    assert not refusals.total
     from echelon.sim.notebook import open_run
 
     recorded = open_run(folder).robots["g1/r1"]

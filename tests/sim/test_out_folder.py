@@ -161,14 +161,14 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     first = start_echelon("run", "lab", "--set", "duration=1000.0", "--can", "none", "--quiet", "--out", folder)
     try:
-        assert until((folder / "run.mcap").exists, 60)
+        assert until((folder / "run.mcap").exists)
         before = (folder / "scenario.toml").read_bytes()
         says = f"echelon: --out {folder}: a run is going on there; give another folder\n"
         assert run(folder) == run(folder, "paper", "--replace") == (2, says)
         assert (folder / "scenario.toml").read_bytes() == before
     finally:
         kill_session(first.pid)
-        first.communicate(timeout=20)
+        first.communicate(timeout=600)
     assert run(folder) == (0, "")
 
 
@@ -188,3 +188,17 @@ def test_a_script_may_run_into_the_same_folder_again(tmp_path: Path) -> None:
         assert done.scenario == scenario
     with pytest.raises(UsageError, match="or replace=True to delete that run"):
         api.run("lab", changes, engine="inprocess", out=tmp_path / "run", quiet=True)
+
+
+def test_the_note_of_a_killed_run_covers_names_of_runs_alone(tmp_path: Path) -> None:
+    """Whoever writes the note, or leaves a link, takes no file of the user's with it."""
+    (tmp_path / ".echelon.json").write_text('{"scenario": "any", "files": {"thesis.tex": null, "run.mcap": null}}')
+    (tmp_path / "thesis.tex").write_text("of the user")
+    with out_folder("any", tmp_path, ["run.mcap"]):
+        pass
+    assert (tmp_path / "thesis.tex").read_text() == "of the user"
+    (tmp_path / ".echelon.json").write_text('{"scenario": "any", "files": {"run.mcap": null}}')
+    (tmp_path / "run.mcap").symlink_to(tmp_path / "thesis.tex")
+    with pytest.raises(UsageError, match=r"run\.mcap"), out_folder("any", tmp_path, ["run.mcap"]):
+        pass
+    assert (tmp_path / "run.mcap").is_symlink()

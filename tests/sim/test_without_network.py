@@ -24,7 +24,7 @@ def offline(*command: str | Path) -> subprocess.CompletedProcess[str]:
         "sh",
         *map(str, command),
     ]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600, check=False)
     if done.stderr.startswith("unshare:"):
         pytest.skip(f"no network namespace can be made here: {done.stderr.strip()}")
     return done

@@ -3,7 +3,7 @@
 import numpy as np
 
 from echelon.messages import Message
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.runtime.fates import Fates
 from echelon.runtime.link import Link
 

@@ -24,7 +24,7 @@ _ACCELERATION = field_index(STATE_FIELDS, "ax", "ay")
 class PointRobot:
     """A double integrator as a role, which moves when it is asked for its state or told another acceleration."""
 
-    def __init__(self, plan: Plan, index: int) -> None:
+    def __init__(self, plan: Plan, index: int, loop: object = None) -> None:
         robot = plan.robots[index]
         self.index, self._plan = index, robot
         self.p, self.v, self.a = np.array(robot.start), np.zeros(2), np.zeros(2)

@@ -31,7 +31,7 @@ def trace_of(plan: Plan) -> Trace:
 
 
 def echelon(
-    *arguments: str | Path, timeout: float = 120, cwd: Path = ROOT, typed: str = "", **options: Any
+    *arguments: str | Path, timeout: float = 600, cwd: Path = ROOT, typed: str = "", **options: Any
 ) -> subprocess.CompletedProcess[str]:
     """Runs the command line to its end; `typed` is its standard input."""
     command = [sys.executable, "-m", "echelon", *map(str, arguments)]
@@ -40,8 +40,9 @@ def echelon(
     )
 
 
-def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
-    """Starts the command line in a process session of its own, so that all its processes can be found."""
+def start_echelon(*arguments: str | Path, **options: Any) -> subprocess.Popen[str]:
+    """Starts the command line in a process session of its own, so that all its processes can be found; `options` are those of
+    Popen."""
     return subprocess.Popen(
         [sys.executable, "-m", "echelon", *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -53,6 +54,7 @@ def start_echelon(*arguments: str | Path) -> subprocess.Popen[str]:
         preexec_fn=lambda: signal.signal(
             signal.SIGINT, signal.SIG_DFL
         ),  # otherwise SIGINT is ignored if the tests run in the background
+        **options,
     )
 
 
@@ -96,7 +98,7 @@ def pid_of(name: str, processes: list[int]) -> int:
     return pid
 
 
-def until(condition: Any, timeout_s: float = 20.0) -> bool:
+def until(condition: Any, timeout_s: float = 600.0) -> bool:
     """Waits until a condition about other processes holds; returns False if it does not hold in time.  It polls, because there
     is no event to wait for."""
     import time

@@ -24,7 +24,7 @@ URL = "socketcan:vcan0"
 EDS = str(Path(cia402.__file__).with_name("drive.eds"))
 PLAN = drive_plan("cia402", (5, 6), watchdog_ns=800 * MS, recover_ns=100 * MS, motor=motor_plan(rated_torque=0.8))
 HOST_NODE = 127
-PATIENCE_S = 20.0
+PATIENCE_S = 600.0
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ def as_processes(
 
 def finished(run: subprocess.Popen[str], folder: Path, code: int = 0) -> dict[str, Any]:
     """Waits for the end of a run; returns its summary."""
-    _, said = run.communicate(timeout=100)
+    _, said = run.communicate(timeout=600)
     assert run.returncode == code, said
     assert "Traceback" not in said
     summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
@@ -104,7 +104,7 @@ def test_processes_on_the_bus_give_the_run_of_one_process(protocol: str, tmp_pat
     digest = in_one_process(LAB, overrides, tmp_path / "one")
     out = tmp_path / "candump.log"
     with out.open("w") as file, subprocess.Popen(["candump", "-L", "vcan0"], stdout=file) as candump:
-        limit_s = time.monotonic() + 20
+        limit_s = time.monotonic() + 600
         while not somebody_listens() and time.monotonic() < limit_s:
             assert candump.poll() is None
         summary = finished(as_processes(LAB, overrides, tmp_path / "run", "vcan0"), tmp_path / "run")
@@ -114,7 +114,9 @@ def test_processes_on_the_bus_give_the_run_of_one_process(protocol: str, tmp_pat
     logged, heard = frames(tmp_path / "run" / "can.log"), frames(out)
     assert (summary["can"]["frames"], summary["can"]["foreign"]) == (len(logged), 0)
     assert not Counter(logged) - Counter(heard)
-    assert len(heard) - len(logged) < len(logged) / 50  # drives' frames that a real bus would not have carried yet
+    # Not logged: drives' frames that a real bus would not have carried yet, and what drives say for two watchdogs (0.2 s) after
+    # the end.  The log is of 0.8 s at least.
+    assert len(heard) - len(logged) < 0.3 * len(logged)
     database = cantools.database.can.Database()
     database.add_dbc_file(tmp_path / "run" / "torque.dbc")
     of_bridge = {f"{message.frame_id:03X}" for message in database.messages if message.senders == ["bridge"]}
@@ -150,7 +152,7 @@ def carried(interface: str) -> int:
 def await_torque(raw: socket.socket) -> None:
     """Waits until a torque is sent to a robot."""
     codec = NativeCodec(0.001)
-    limit_s = time.monotonic() + 60
+    limit_s = time.monotonic() + 600
     while time.monotonic() < limit_s:
         can_id, data = next_frame(raw)
         torque = codec.decode(can_id, data) if can_id < FEEDBACK_ID else None
@@ -195,7 +197,7 @@ def test_on_a_wall_clock_watchdogs_stop_the_wheels(interface: str, trio: Path, t
         down_for(4.0, run, interface)
         with listener(interface) as raw:
             said: dict[int, Feedback] = {}
-            limit_s = time.monotonic() + 60
+            limit_s = time.monotonic() + 600
             while len(said) < 3 or any(FaultCode.NONE in feedback.faults for feedback in said.values()):
                 assert time.monotonic() < limit_s, said
                 can_id, data = next_frame(raw)

@@ -66,6 +66,13 @@ class Client:
             feedback = self.heard()
         return feedback
 
+    def hear_until(self, wanted: Callable[[Feedback], bool]) -> Feedback:
+        """Hears feedback until one is `wanted`; returns that one."""
+        for _ in range(500):
+            if wanted(feedback := self.heard()):
+                return feedback
+        raise AssertionError(f"never as wanted, last {feedback}")
+
     def hold(self, right: float, left: float, wanted: Callable[[Feedback], bool], clear: bool = False) -> Feedback:
         """Sends the command after each feedback until one is `wanted`; returns that one."""
         for _ in range(500):
@@ -77,14 +84,15 @@ class Client:
 
 
 @pytest.fixture
-def client() -> Iterator[Client]:
+def client(bench: Bench) -> Iterator[Client]:
     made = Client()
     with made.socket:
+        # Feedback that the kernel still carries for an earlier bench comes first; the drive of this one begins disabled.
+        made.hear_until(lambda said: said.states == (WheelState.DISABLED,) * 2)
         yield made
 
 
 def test_enable_torque_and_watchdog(bench: Bench, client: Client) -> None:
-    assert client.heard().states == (WheelState.DISABLED,) * 2
     client.hold(0.0, 0.0, lambda said: said.states == (ON, ON))
     client.hold(0.5, -0.25, lambda said: said.torques == pytest.approx((0.5, -0.25)))
     with bench.lock:
@@ -151,7 +159,7 @@ def test_candump_and_cantools_show_what_the_drive_says(bench: Bench, client: Cli
             client.command(0.375, -0.125, clear=FAULT in client.latest().states)
     decode = [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)]
     with log.open() as file:
-        decoded = subprocess.run(decode, stdin=file, capture_output=True, text=True, timeout=100, check=True)
+        decoded = subprocess.run(decode, stdin=file, capture_output=True, text=True, timeout=600, check=True)
     shown = decoded.stdout.splitlines()
     assert len(shown) == 150
     assert {found[1] for line in shown if (found := re.search(r":: (\w+)\(", line))} == {

@@ -2,7 +2,8 @@
 class derived from it.
 
 NMT state          entered when                               what the node does
-BOOT UP            at power-on; NMT reset node; NMT reset     sends its boot-up message, then PRE-OPERATIONAL
+BOOT UP            at the first call with a time; when the    hears nothing for `BOOT_NS` (the first time it is ready at once);
+                   power is back; NMT reset node; NMT reset   sends its boot-up message, then PRE-OPERATIONAL
                    communication
 PRE-OPERATIONAL    after boot-up; NMT command                 SDO, heartbeat, emergency messages
 OPERATIONAL        NMT start                                  also PDOs
@@ -15,6 +16,7 @@ Frames that are refused are counted by reason.
 """
 
 from collections.abc import Mapping
+from typing import Final
 
 from echelon.bridge.protocols.cia402 import objects
 from echelon.bridge.protocols.cia402.codec import (
@@ -40,6 +42,8 @@ from echelon.bridge.protocols.frame import Frame
 from echelon.plan.can_plan import NEVER_NS
 
 MS = 1_000_000
+BOOT_NS: Final = 10 * MS
+"""How long a node boots: so who has just sent a reset can begin to listen for the boot-up message"""
 
 
 class Node(ProcessData):
@@ -79,7 +83,7 @@ class Node(ProcessData):
         """Lets all events up to and including `time_ns` happen, in order of time."""
         if not self._begun:
             self._begun = True
-            self._power_on(time_ns)
+            self._power_on(time_ns, 0)
         due = self._due
         while due:
             what = min(due, key=due.__getitem__)
@@ -96,6 +100,8 @@ class Node(ProcessData):
     def receive(self, time_ns: int, frame: Frame) -> list[Frame]:
         """Takes a frame; returns the immediate answers."""
         out = self.advance(time_ns)
+        if self.nmt is Nmt.BOOT_UP:
+            return out
         self._now_ns = time_ns
         can_id, data, remote = frame
         numbers = self._numbers.get(can_id)
@@ -153,19 +159,19 @@ class Node(ProcessData):
 
     # network management
 
-    def _power_on(self, time_ns: int) -> None:
+    def _power_on(self, time_ns: int, boot_ns: int = BOOT_NS) -> None:
         """Begins as after power-on: all objects have their first values."""
         self._od.reset()
         self._switch_on(time_ns)
-        self._boot(time_ns)
+        self._boot(time_ns, boot_ns)
 
-    def _boot(self, time_ns: int) -> None:
-        """Begins to boot: the node sends its boot-up message next."""
+    def _boot(self, time_ns: int, boot_ns: int = BOOT_NS) -> None:
+        """Begins to boot: the node sends its boot-up message after `boot_ns`."""
         self.nmt = Nmt.BOOT_UP
         self._host_lost = False
         self._sdo.reset()
         self._due.clear()
-        self._due["boot", 0] = time_ns
+        self._due["boot", 0] = time_ns + boot_ns
         self._configure()
 
     def _manage(self, time_ns: int, data: bytes) -> None:

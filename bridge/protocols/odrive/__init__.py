@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from echelon.bridge.protocols.protocol import DriveProtocol
 
@@ -20,6 +20,10 @@ class ODrive(DriveProtocol):
     nodes: ClassVar[range] = range(63)
     empty_asks: ClassVar[bool] = True
 
+    control_mode: Literal["position", "torque"] = "position"
+    """The mode that is stored in a virtual drive, which it has from power-on: `position` as delivered, or `torque`.  With
+    `torque` a host need not send `Set_Controller_Mode`"""
+
     def identifiers(self, node: int) -> frozenset[int]:
         """Returns the identifiers of a node's 32 commands."""
         from echelon.bridge.protocols.odrive.codec import frame_id
@@ -34,9 +38,12 @@ class ODrive(DriveProtocol):
 
     def drive(self, drive: DrivePlan, number: int) -> Drive:
         """Returns a virtual axis."""
+        from echelon.bridge.protocols.odrive.config import ODriveConfig
         from echelon.bridge.protocols.odrive.drive import ODriveDrive
+        from echelon.bridge.protocols.odrive.enums import ControlMode
 
-        return ODriveDrive(drive, number)
+        stored = ControlMode.TORQUE_CONTROL if self.control_mode == "torque" else ControlMode.POSITION_CONTROL
+        return ODriveDrive(drive, number, ODriveConfig(control_mode=stored))
 
     def observer(self, drive: DrivePlan, envelope: EnvelopePlan, closed: bool) -> Observer:
         """Returns the observer of a robot's frames; on the mirrored path it expects no heartbeats."""

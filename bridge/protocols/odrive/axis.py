@@ -79,7 +79,7 @@ class Axis:
         self.state = AxisState.IDLE
         self.errors = self.disarm_reason = AxisError.NONE
         self.result = ProcedureResult.SUCCESS
-        self._modes = (int(ControlMode.POSITION_CONTROL), int(InputMode.PASSTHROUGH))
+        self._modes = (int(self._config.control_mode), int(InputMode.PASSTHROUGH))
         self._target = 0.0
         self._limit = self._plan.motor.torque_limit
         self.offset = 0.0

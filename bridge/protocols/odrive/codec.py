@@ -97,9 +97,15 @@ class Message:
     def decode(self, data: bytes) -> tuple[Any, ...] | Refusal:
         """Returns the signals' values in order, or the reason to refuse the data.  Never raises.
 
-        Data may be shorter than `length`, but must hold all signals."""
-        if not self.layout.size <= len(data) <= LENGTH:
+        A report must hold all signals.  In a command, missing bytes are zero, as in the vendor's open firmware, which clears
+        its buffer before each frame."""
+        size = len(data)
+        if size > LENGTH:
             return Refusal.LENGTH
+        if size < self.layout.size:
+            if self.reported:
+                return Refusal.LENGTH
+            data = data.ljust(self.layout.size, b"\0")
         values = self.layout.unpack_from(data)
         for value in values:
             if value.__class__ is float and not isfinite(value):

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from echelon.bridge.protocols.odrive.enums import Command
+from echelon.bridge.protocols.odrive.enums import Command, ControlMode
 from echelon.plan.can_plan import DrivePlan
 
 _NS = 1_000_000
@@ -10,7 +10,9 @@ _NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class ODriveConfig:
-    """The fields of `axis0.config` and `axis0.config.can` in the vendor's tool.  Periods are in ms; 0 means: only on request.
+    """Fields of `axis0.config`, `axis0.config.can` and `axis0.controller.config` in the vendor's tool.
+
+    Periods are in ms; 0 means: only on request.
 
     Raises ValueError for a negative period."""
 
@@ -24,6 +26,8 @@ class ODriveConfig:
     torques_msg_rate_ms: int | None = None
     """None: the period of the plan"""
     powers_msg_rate_ms: int = 0
+    control_mode: ControlMode = ControlMode.POSITION_CONTROL
+    """The mode after power-on (`axis0.controller.config.control_mode`); the input mode is PASSTHROUGH"""
     enable_watchdog: bool = True
     """The timeout of the watchdog is the plan's"""
     every_frame_feeds: bool = False

@@ -174,7 +174,7 @@ def study_sections(results: StudyResults) -> list[str]:
     ]
     if rows := boundary_rows(results):
         assert results.axis is not None
-        head = [*(key.name for key in results.others(results.axis)), "by", "holds up to", "fails at", "predicted"]
+        head = [*(key.label for key in results.others(results.axis)), "by", "holds up to", "fails at", "predicted"]
         parts.append(
             section(
                 f"Largest {results.axis.label}", "", [table(head, rows, numeric_from=len(head) - 3, what="boundaries")]

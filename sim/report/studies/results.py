@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echelon.sim.report.drawing import CENTROID, GROUPS, INTER, MARKS, Array, Look
+from echelon.sim.report.studies.words import label_of
 
-SECONDS: Final = frozenset({
-    "delay", "duration", "at", "timeout", "std", "min", "max", "scale", "acceleration", "torque", "period", "offset",
-})  # fmt: skip
-"""Last parts of keys whose values are in seconds"""
 HOLDS: Final = 0.5
 """A point holds if at least this share of its runs does"""
 MOST_LINES: Final = 4
@@ -31,10 +28,13 @@ class Key:
     """Its value at each point, as text"""
     numbers: Array | None
     """Its value at each point; None if its values are no numbers"""
+    label: str = field(default="", compare=False)
+    """The key in words, with its unit, as the label of an axis"""
 
     @classmethod
-    def of(cls, name: str, values: Sequence[Any]) -> "Key":
-        """Returns a key from its values at each point: floats, or TOML text.
+    def of(cls, name: str, values: Sequence[Any], scenario: Mapping[str, Any] | None = None) -> "Key":
+        """Returns a key from its values at each point: floats, or TOML text.  `scenario` is the table of the scenario, which
+        says of which links a rule is.
 
         Lists of numbers in which one entry varies, or in which all entries are equal, count as that number: `[0.1, 0.1]`."""
         texts = tuple(f"{value:g}" if isinstance(value, float) else str(value).strip('"') for value in values)
@@ -42,12 +42,7 @@ class Key:
             numbers = _single([tomllib.loads(f"value = {value}")["value"] for value in values])
         except ValueError:
             numbers = None
-        return cls(name, texts, numbers)
-
-    @property
-    def label(self) -> str:
-        """The key with its unit, as the label of an axis."""
-        return f"{self.name} [s]" if self.name.rpartition(".")[2] in SECONDS else self.name
+        return cls(name, texts, numbers, label_of(name, {} if scenario is None else scenario))
 
     @property
     def kind(self) -> Kind:

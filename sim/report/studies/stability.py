@@ -250,7 +250,7 @@ def _side_by_side(axis: Key, bounds: Sequence[Boundary], results: StudyResults, 
         axes.invert_yaxis()
         axes.grid(False, axis="y")
         axes.margins(x=0.14)
-        axes.set_xlabel(f"largest {axis.label} that holds")
+        axes.set_xlabel(f"largest {axis.label}")
 
     return Picture(width, 0.42 * len(bounds) + 0.9, draw)
 

@@ -55,7 +55,7 @@ def test_a_killed_process_loses_only_what_is_younger(tmp_path: Path) -> None:
         "for number in range(1000): log.write(number, 1, bytes(8), number * FLUSH_NS // 100)\n"
         "os.kill(os.getpid(), 9)\n"
     )
-    run = subprocess.run([sys.executable, "-c", program, str(path)], cwd=ROOT, timeout=60, check=False)
+    run = subprocess.run([sys.executable, "-c", program, str(path)], cwd=ROOT, timeout=600, check=False)
     assert run.returncode == -signal.SIGKILL
     lines = path.read_text().splitlines()
     assert 900 <= len(lines) <= 1000  # 1000 frames in 1 s of wall time: at most the last 0.1 s is missing
@@ -86,7 +86,7 @@ def test_cantools_decodes_it(tmp_path: Path) -> None:
     dbc.write_text(lab_dbc())
     with path.open() as log:
         command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)]
-        run = subprocess.run(command, stdin=log, capture_output=True, text=True, check=True, timeout=60)
+        run = subprocess.run(command, stdin=log, capture_output=True, text=True, check=True, timeout=600)
     shown = run.stdout.splitlines()
     assert len(shown) == 300
     assert "torque_g1_r2(tau_right: 0.299 Nm, tau_left: -0.299 Nm" in shown[299]
@@ -97,7 +97,7 @@ def test_log2asc_reads_it(tmp_path: Path) -> None:
     path = tmp_path / "can.log"
     frames = write_some(path)
     command = ["log2asc", "-I", str(path), "vcan0"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout
     assert [line.upper() for line in shown.splitlines() if " 101 " in line][299].split("D 8 ")[1].split() == (
         frames[299].hex(" ").upper().split()
     )

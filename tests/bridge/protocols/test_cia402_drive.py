@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from echelon.bridge.protocols.cia402.drive import Cia402Drive
+from echelon.bridge.protocols.cia402.node import BOOT_NS
 from echelon.bridge.protocols.cia402.sdo import Abort, SdoClient
 from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
@@ -17,6 +18,7 @@ from support.bench_drives import MS, motor_plan
 from support.cia402_rig import plan_of
 
 NODE = 5
+BOOT_MS = BOOT_NS / MS
 BIT = 1e-3  # N m: the rated torque is 1 N m
 PATHS = {
     "SWITCH ON DISABLED": [],
@@ -578,6 +580,8 @@ def test_a_node_that_is_told_to_rest_has_no_torque(command: int) -> None:
     client.heard.clear()
     client.send(0, bytes((command, 0)))
     assert client.motor.torque == 0.0
+    if command > 128:
+        client.wait(BOOT_MS)
     client.target(500)
     assert client.motor.torque == 0.0
     assert client.drive.refused == {"not operational": 1}
@@ -595,14 +599,28 @@ def test_a_node_that_is_told_to_rest_has_no_torque(command: int) -> None:
     assert client.emergencies() == []
 
 
+@pytest.mark.parametrize("command", [129, 130])
+def test_who_has_sent_a_reset_can_begin_to_listen_for_the_boot_up(command: int) -> None:
+    client = Client().enable()
+    assert client.send(0, bytes((command, NODE))) == []
+    assert client.wait(BOOT_MS - 0.001) == []
+    client.start()  # it is not heard yet
+    assert client.send(0x605, bytes.fromhex("4000100000000000")) == []
+    assert client.wait(0.001) == [Frame(0x705, b"\0")]
+    assert client.wait(100) == [Frame(0x705, b"\x7f")]
+    assert client.drive.refused == {}
+
+
 def test_resets_forget_what_they_should() -> None:
     client = Client()
     client.write(0x1017, 33)
     client.write(0x6060, 10)
     client.write(0x6072, 44)
     client.send(0, bytes((130, NODE)))
+    client.wait(BOOT_MS)
     assert (client.read(0x1017), client.read(0x6060), client.read(0x6072)) == (100, 10, 44)
     client.send(0, bytes((129, NODE)))
+    client.wait(BOOT_MS)
     assert (client.read(0x1017), client.read(0x6060), client.read(0x6072)) == (100, 0, 1500)
     client.send(0, bytes((129, NODE + 1)))
     client.send(0, bytes((3, NODE)))
@@ -615,10 +633,12 @@ def test_a_reset_does_not_forget_that_there_was_a_fault() -> None:
     client.drive.inject(client.time_ns, 0, Fault.ENCODER_LOSS)
     client.heard.clear()
     client.send(0, bytes((129, NODE)))
+    client.wait(BOOT_MS)
     assert client.state == "FAULT"  # its cause is still there
     assert client.emergencies() == [(0x7305, 0x21)]
     client.drive.mend(client.time_ns, 0, Fault.ENCODER_LOSS)
     client.send(0, bytes((129, NODE)))
+    client.wait(BOOT_MS)
     assert client.state == "SWITCH ON DISABLED"
     client.enable()
     client.target(500)
@@ -641,7 +661,7 @@ def test_silence() -> None:
         assert client.sync() == {}
     assert client.heard == []
     client.drive.mend(client.time_ns, 0, Fault.SILENT)
-    assert client.wait(0) == [Frame(0x705, b"\0")]
+    assert client.wait(BOOT_MS) == [Frame(0x705, b"\0")]
     assert client.state == "SWITCH ON DISABLED"
     assert client.read(0x6060) == 0
 

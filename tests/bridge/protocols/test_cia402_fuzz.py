@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from echelon.bridge.protocols.cia402.codec import State
+from echelon.bridge.protocols.cia402.codec import Nmt, State
 from echelon.bridge.protocols.cia402.drive import Cia402Drive
 from echelon.bridge.protocols.cia402.host import Cia402Host
 from echelon.bridge.protocols.faults import ON_DEMAND
@@ -75,11 +75,13 @@ def test_a_drive(seed: int) -> None:
             ways = [Frame(0, bytes((1, NODE))), *way, Frame(0x305, b"\0\0"), Frame(0x305, b"\1\0")]
             frames = [*ways, *frames]
         for frame in frames:
-            refused = drive.refused.total()
+            refused, booting = drive.refused.total(), drive.nmt is Nmt.BOOT_UP
             drive.receive(time_ns, frame)
             if frame.remote or frame.can_id not in drive.identifiers:
                 assert drive.refused.total() >= refused
-            if frame.remote:
+            if booting:  # it hears nothing
+                assert drive.refused.total() == refused
+            elif frame.remote:
                 assert drive.refused.total() == refused + 1
             assert drive.state is State.OPERATION_ENABLED or motor.torque == 0.0
             enabled += drive.state is State.OPERATION_ENABLED

@@ -184,6 +184,7 @@ def test_recovery_after_its_time() -> None:
 def test_a_drive_that_restarts_is_brought_up_anew() -> None:
     rig = Rig(plan_of(recover_ns=50 * MS)).bring_up()
     rig.to_drives([Frame(0, b"\x81\x05")])
+    rig.cycles(2)
     assert rig.host.fault == "right: restarted"
     rig.cycles(60, 0.5, 0.5)
     assert rig.host.enabled

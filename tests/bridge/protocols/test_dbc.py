@@ -96,6 +96,6 @@ def test_cantools_decode_shows_newton_metres(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(dbc)]
     # a log file, and what candump shows
     for line in (f"(1700000000.010000) vcan0 102#{data.hex().upper()}", f"  vcan0  102   [8]  {data.hex(' ').upper()}"):
-        run = subprocess.run(command, input=line + "\n", capture_output=True, text=True, check=True, timeout=60)
+        run = subprocess.run(command, input=line + "\n", capture_output=True, text=True, check=True, timeout=600)
         assert run.stdout.startswith(line)
         assert "torque_g1_r3(tau_right: 1.25 Nm, tau_left: -0.75 Nm, enable_right: 1, enable_left: 1," in run.stdout

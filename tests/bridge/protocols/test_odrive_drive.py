@@ -12,9 +12,12 @@ from echelon.bridge.protocols.faults import Fault
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.odrive.config import ODriveConfig
 from echelon.bridge.protocols.odrive.drive import ODriveDrive
-from echelon.bridge.protocols.odrive.enums import AxisError, AxisState
+from echelon.bridge.protocols.odrive.enums import AxisError, AxisState, ControlMode
+from echelon.bridge.protocols.registry import drive_places
+from echelon.bridge.protocols.registry import make_drive as make_drive_at
 from support.bench_drives import MS, drive_plan, motor_plan
 from support.odrive_vendor import BROADCAST, VENDOR, frame, heard, last, request
+from support.runs import plan_of
 
 WATCHDOG_NS = 100 * MS
 CYCLIC_MS = {
@@ -249,12 +252,10 @@ REFUSED: list[tuple[str, Frame]] = [
     ("identifier", Frame(0x4E + (1 << 11), struct.pack("<f", 0.1))),
     ("identifier", Frame(-1)),
     ("command", Frame(0x48, bytes(8))),
-    ("length", Frame(0x4E, struct.pack("<f", 0.1)[:3])),
-    ("length", Frame(0x4E)),
     ("length", Frame(0x4E, bytes(9))),
-    ("length", Frame(0x47, bytes(3))),
-    ("length", frame(2, "Set_Controller_Mode")._replace(data=bytes(7))),
-    ("length", frame(2, "Clear_Errors")._replace(data=b"")),
+    ("state", Frame(0x47, bytes(3))),
+    ("state", Frame(0x47)),
+    ("controller mode", frame(2, "Set_Controller_Mode")._replace(data=bytes(7))),
     ("not finite", frame(2, "Set_Input_Torque", Input_Torque=math.nan)),
     ("not finite", frame(2, "Set_Input_Torque", Input_Torque=math.inf)),
     ("not finite", frame(2, "Set_Limits", Velocity_Limit=-math.inf)),
@@ -286,6 +287,45 @@ def test_what_is_refused_is_counted_changes_nothing_and_feeds_nothing(reason: st
     assert drive.motor.torque == 0.5
     drive.advance(WATCHDOG_NS)
     assert drive.errors is AxisError.WATCHDOG_TIMER_EXPIRED
+
+
+def test_missing_bytes_of_a_command_are_zero() -> None:
+    drive = make_drive()
+    drive.receive(0, Frame(0x4B, b"\x01\0\0\0\x01"))
+    drive.receive(0, Frame(0x47, b"\x08"))
+    assert drive.state is AxisState.CLOSED_LOOP_CONTROL
+    torque(drive, 0, 0.5)
+    drive.receive(0, Frame(0x4E, struct.pack("<f", 1.0)[:3]))  # 0.0 if the last byte is zero: 1.0 is 00 00 80 3F
+    assert drive.motor.torque == pytest.approx(0.0, abs=1e-30)
+    torque(drive, 0, 0.5)
+    drive.receive(0, Frame(0x4E))
+    assert drive.motor.torque == 0.0
+    drive.receive(0, Frame(0x42))
+    drive.receive(0, Frame(0x58))  # Clear_Errors without its byte
+    assert (drive.errors, drive.refused) == (AxisError.NONE, {})
+
+
+def test_a_mode_that_is_stored_in_the_drive_need_not_be_set() -> None:
+    drive = make_drive(config=ODriveConfig(control_mode=ControlMode.TORQUE_CONTROL))
+    for time_ns in (0, 2 * MS):
+        drive.receive(time_ns, Frame(0x47, b"\x08"))
+        assert drive.state is AxisState.CLOSED_LOOP_CONTROL
+        drive.receive(time_ns + MS, frame(2, "Reboot"))  # it is stored
+        assert drive.state is AxisState.IDLE
+    assert drive.refused == {}
+    other = make_drive()
+    other.receive(0, Frame(0x47, b"\x08"))
+    assert other.refused == {"state without torque control": 1}
+
+
+def test_the_stored_mode_is_a_key_of_the_scenario() -> None:
+    modes = []
+    for parameters in ("", ", parameters={control_mode='torque'}"):
+        plan = plan_of("lab", f"robot.drive.protocol={{use='odrive'{parameters}}}", "can.path=closed", "claims=[]")
+        drive = make_drive_at(plan, drive_places(plan)[0])
+        assert isinstance(drive, ODriveDrive)
+        modes.append(drive.config.control_mode)
+    assert modes == [ControlMode.POSITION_CONTROL, ControlMode.TORQUE_CONTROL]
 
 
 @pytest.mark.parametrize("fault", [Fault.OVER_TEMPERATURE, Fault.ENCODER_LOSS, Fault.BROWN_OUT])
@@ -603,9 +643,10 @@ def must_be_refused(sent: Frame) -> bool:
     if reports and (sent.remote or not sent.data):
         return False
     needed = max(signal.start + signal.length for signal in message.signals)
-    if sent.remote or reports or command == 6 or not needed <= 8 * len(sent.data) <= 64:
+    if sent.remote or reports or command == 6 or len(sent.data) > 8:
         return True
-    values = message.decode(sent.data, allow_truncated=True, decode_choices=False)
+    # bytes that are missing are zero
+    values = message.decode(sent.data.ljust(-(-needed // 8), b"\0"), allow_truncated=True, decode_choices=False)
     assert isinstance(values, dict)
     return not all(math.isfinite(float(str(value))) for value in values.values())
 

@@ -120,8 +120,7 @@ def test_what_must_come_regularly() -> None:
 
 
 BAD: list[tuple[str, Frame]] = [
-    ("length", Frame(0x2E, bytes(3))),
-    ("length", Frame(0x2E)),
+    ("length", Frame(0x2E, bytes(9))),
     ("length", Frame(0x21, bytes(7))),
     ("length", Frame(0x3C, bytes(4))),
     ("not finite", commanded(math.nan)),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from echelon.bridge.can.canlog import read_log
+from echelon.bridge.can.log_files import frames_in
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.plan_dbc import plan_dbc
 from echelon.bridge.protocols.registry import make_drive, make_host, make_observer
@@ -91,10 +91,11 @@ def test_the_dbc_and_the_mirrored_path(folder: Path, tmp_path: Path) -> None:
     sets = ("--set", "can.path=mirror", "--set", "duration=0.5", "--set", "claims=[]", "--can", "virtual")
     done = echelon("run", folder / "my_drive.toml", "--engine", "inprocess", *sets, *QUIET, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
-    frames = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log")]
-    assert len(frames) == 3 * 50
+    frames = [frame for _, _, frame in frames_in(tmp_path / "run" / "can.log")]
+    assert len(frames) == 3 * 50 + 3  # the last of each robot takes the torque away
     assert {frame.can_id for frame in frames} == {0x300, 0x301, 0x302}
-    assert all(frame.data[4] == 1 for frame in frames)
+    assert all(frame.data[4] == 1 for frame in frames[:-3])
+    assert all(frame.data[4] == 0 for frame in frames[-3:])
     assert summary_of(tmp_path / "run")["can"]["referee"]["findings"] == []
 
 
@@ -115,7 +116,7 @@ def test_what_fails_in_a_run_is_one_line_and_wheels_are_stopped_first(
     assert done.returncode == 3
     (line,) = done.stderr.splitlines()
     assert re.search(rf"my_drive\.py(:|, line \d+: )MyProtocol of r1: {says}", line)
-    frames = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log")]
+    frames = [frame for _, _, frame in frames_in(tmp_path / "run" / "can.log")]
     assert [(frame.can_id, frame.data) for frame in frames[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
     assert any(says in reason for reason in reasons(summary_of(tmp_path / "run")))
 
@@ -128,7 +129,7 @@ def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Pa
     assert done.returncode == 3
     assert "echelon: my_drive.py, line 54: MyProtocol of r" in done.stderr
     assert "its host's command raised KeyError: 'w'" in done.stderr
-    commands = [frame for _, _, frame in read_log(tmp_path / "run" / "can.log") if frame.can_id < 0x380]
+    commands = [frame for _, _, frame in frames_in(tmp_path / "run" / "can.log") if frame.can_id < 0x380]
     assert [(frame.can_id, frame.data) for frame in commands[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
 
 

@@ -14,18 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from echelon.bridge.can.canlog import CanLog
-from echelon.bridge.frame_message import unpack
 from echelon.bridge.protocols.frame import Frame
-from echelon.bridge.referee.referee import KEPT, Referee, judge_log
-from echelon.bridge.reports import FindingReport
+from echelon.bridge.referee.log import judge_log
+from echelon.bridge.referee.referee import KEPT, Referee
+from echelon.bridge.referee_reports import FindingReport
 from echelon.bridge.stations.mirror import MirrorBridge
-from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.sim.engines.in_process import Engine
+from support.closed_run import Heard, run
 from support.runs import plan_of
 
 MS = 1_000_000
-Heard = tuple[int, int, Frame]
 PROTOCOLS = ("native", "odrive", "cia402")
 IDENTIFIERS = {
     "native": 9 * 3,
@@ -39,29 +38,6 @@ REPORT_IDS = {"native": (0x180,), "odrive": (0x3C, 0x5C), "cia402": (0x281, 0x28
 """Identifiers of the torque reports of robot 0"""
 many = settings(max_examples=12, deadline=None)
 each_protocol = pytest.mark.parametrize("protocol", PROTOCOLS)
-
-
-@cache
-def run(protocol: str, *overrides: str) -> tuple[Plan, tuple[Heard, ...]]:
-    """Returns the plan of a short closed run, and all frames that its buses carried."""
-    plan = plan_of(
-        "lab",
-        "can.path=closed",
-        "can.bitrate=1000000",
-        "can.bring_up=0.7",
-        "duration=1",
-        "claims=[]",
-        f"robot.drive.protocol={protocol}",
-        *overrides,
-    )
-    carried: list[Heard] = []
-
-    def take(message: Message) -> None:
-        if message.channel is Channel.FRAMES and message.source == plan.bridge.index:
-            carried.extend((timed.time_ns, timed.bus, timed.frame) for timed in unpack(message.values))
-
-    Engine(plan, take).run()
-    return plan, tuple(carried)
 
 
 def judged(plan: Plan, frames: list[Heard] | tuple[Heard, ...]) -> Referee:
@@ -443,7 +419,7 @@ def test_planned_faults() -> None:
 def test_the_log_of_a_run(tmp_path: Path) -> None:
     plan, frames = run("native")
     path = tmp_path / "can.log"
-    with CanLog(path, "can0", plan.can.bring_up_ns) as log:
+    with CanLog(path, "can0") as log:
         for time_ns, _, (can_id, data, remote) in frames:
             log.write(time_ns, can_id, data, 0, "", remote)
     summary = judge_log(path, plan)

@@ -89,6 +89,7 @@ def test_without_lag_and_delay_it_is_the_mirrored_path_with_rounded_torques_bit_
         if plan is mirrored:
             for role in engine.roles[: len(plan.robots)]:
                 role._limits = RoundedLimits(role._limits)  # type: ignore[attr-defined]
+                role._constants = None  # type: ignore[attr-defined]  # the usual loop has limits of its own
         engine.run()
         traces.append(builder.build())
     for one, other in zip(traces[0].states, traces[1].states, strict=True):
@@ -434,3 +435,21 @@ def test_one_seed_one_run() -> None:
     noisy: Sequence[str] = ['events=[{kind="error_frames", at=0, rate=0.05}]', 'links=[{channel="torque", loss=0.2}]']
     assert outcome(*noisy) == outcome(*noisy)
     assert outcome(*noisy) != outcome(*noisy, "seed=2")
+
+
+@pytest.mark.parametrize("mirror_fails", [False, True])
+def test_one_protocol_that_fails_at_stopping_does_not_keep_others_turning(
+    mirror_fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge, _ = stations(ran(closed(duration=0.1)))
+
+    def fail(*arguments: object) -> list[Frame]:
+        raise KeyError("a fault of the protocol")
+
+    monkeypatch.setattr(bridge.robots[1].host, "stop", fail)
+    if mirror_fails:
+        monkeypatch.setattr(bridge.robots[1].host, "mirror", fail)
+    frames, failure = bridge.stop(100 * MS)
+    stopped = {timed.frame.can_id - 0x100 for timed in frames if timed.frame.data[:5] == bytes(5)}
+    assert stopped == set(range(9)) - ({1} if mirror_fails else set())
+    assert "a fault of the protocol" in failure

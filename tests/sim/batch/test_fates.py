@@ -7,7 +7,7 @@ import pytest
 
 from echelon.messages import Channel
 from echelon.plan.delay_tables import Bursts, DelayTrace
-from echelon.plan.plan import LinkPlan
+from echelon.plan.link_plan import LinkPlan
 from echelon.planning.delays import make_table
 from echelon.runtime.fates import ALL, Fates, link_key
 from echelon.scenario.link_tables import Gamma, Normal, Pareto, Uniform

@@ -74,6 +74,7 @@ def test_scenario_metadata_and_links_come_back(whole: Path) -> None:
     assert read_links(whole) == [(1_000_000, LINKS[0]), (2_000_000, LINKS[0])]
 
 
+@pytest.mark.slow
 def test_cut_anywhere_it_is_mended(whole: Path, tmp_path: Path) -> None:
     data, everything = whole.read_bytes(), contents(whole)
     cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"

@@ -72,6 +72,45 @@ def test_strangers_and_latecomers_are_refused() -> None:
     assert (order.refused, order.pushed) == (2, 8)
 
 
+def test_on_a_wall_clock_nothing_waits_for_longer_than_the_hold() -> None:
+    order = TimeOrder([0, 1], hold_s=0.05)
+    assert order.push([message(0, 1), message(1, 1)], 10.0) == []
+    assert keys(order.push([message(0, 2), message(1, 2)], 10.01)) == [(1, 0, 1), (1, 1, 1)]
+    assert order.push([message(0, 3)], 10.02) == []  # source 1 is silent from here on
+    assert keys(order.push([message(0, 4)], 10.03)) == []
+    assert keys(order.push([], 10.065)) == [(2, 0, 1), (2, 1, 1)]
+    assert keys(order.push([], 10.075)) == [(3, 0, 1)]
+    assert keys(order.push([message(0, 5), message(0, 6)], 10.09)) == [(4, 0, 1)]
+    # it speaks again: what it owes comes behind the order, in its own order, and nothing is lost
+    assert keys(order.push([message(1, 3), message(1, 4), message(1, 5)], 10.10)) == [(3, 1, 1), (4, 1, 1)]
+    assert keys(order.push([], 10.16)) == [(5, 0, 1), (5, 1, 1), (6, 0, 1)]
+    assert (order.pushed, order.refused) == (11, 0)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), max_size=60), st.sampled_from([0.0, 0.05, 1.0]))
+def test_with_a_hold_everything_is_released_once_and_in_the_order_of_its_source(
+    steps: list[tuple[int, int]], hold_s: float
+) -> None:
+    order, said, released, now_s = TimeOrder([0, 1, 2], hold_s), [0, 0, 0], list[Message](), 0.0
+    sent = []
+    for source, more in steps:
+        now_s += 0.02
+        batch = []
+        for _ in range(more):
+            said[source] += 1
+            batch.append(message(source, said[source]))
+        sent += batch
+        released += order.push(batch, now_s)
+        if hold_s == 0.0:
+            assert len(released) == len(sent)
+    released += order.rest()
+    assert sorted(keys(released)) == sorted(keys(sent))
+    for source in range(3):
+        times = [one.time_ns for one in released if one.source == source]
+        assert times == sorted(times)
+    assert order.refused == 0
+
+
 def test_rest_is_in_order_too() -> None:
     order = TimeOrder([0, 1])
     order.push([message(1, 3), message(1, 4)])

@@ -73,6 +73,7 @@ def readme_scenario() -> str:
 SCENARIOS = {groups: scenario_text("my", sizes(groups), None) for groups in ("1x1", "1x2", "2x3", "2,3,5")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [*SCENARIOS.values(), readme_scenario()], ids=[*SCENARIOS, "README"])
 def test_no_figure_of_a_first_run_gives_a_warning(text: str) -> None:
     """matplotlib warns if what is drawn outside the axes leaves no room for the axes."""

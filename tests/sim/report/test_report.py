@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from echelon.bridge.referee_reports import FindingReport, RefereeReport
 from echelon.bridge.reports import (
     BusEvent,
     BusReport,
     DriveReport,
     DrivesReport,
-    FindingReport,
     IdentifierReport,
-    RefereeReport,
     ScheduledEvent,
     WheelsReport,
 )
@@ -133,6 +132,7 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(single, both):
         assert all(len(label) > 20 for label in labels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [6.0, 0.01])
 def test_the_caption_of_distances_says_what_the_table_below_says(radius, tmp_path):
     made = decaying(["duration=1.0", f"avoidance={{enabled=false, avoidance_radius={radius}, sensing_radius=7.0}}"])
@@ -217,11 +217,18 @@ def test_a_comparison_shows_the_papers_figures_with_the_runs_they_belong_to(both
 
 def test_a_comparison_says_what_differs_and_takes_nothing_of_the_first_run_for_all(both):
     assert "9 robots · 4 nodes · 3 s, 1 s · trace" in both.text
-    (rows,) = re.findall("What differs .* key left right (.*?) Compared", both.text)
+    (rows,) = re.findall("What differs .* key left right (.*?) What was measured", both.text)
     assert rows == (
         'duration 3.0 1.0 avoidance.enabled false true claims.1.block "centroid" "inter" claims.2.block – "centroid" '
         "claims.2.settled_by – 10.0 claims.2.band – 0.05"
     )
+
+
+def test_a_comparison_sets_what_was_measured_side_by_side(both):
+    (rows,) = re.findall("What was measured .*? left right (.*?) Compared", both.text)
+    for measure in ("verdict", "settling to 2 % of g1", "∫|e|² dt of centroid", "smallest distance of two robots"):
+        assert measure in rows
+    assert "g2" in rows
 
 
 def test_figures_of_the_paper_are_named_under_the_papers_scenario_alone(run, single, tmp_path):
@@ -232,6 +239,7 @@ def test_figures_of_the_paper_are_named_under_the_papers_scenario_alone(run, sin
     assert "paper's" not in rendered([mine], tmp_path / "report.html").text
 
 
+@pytest.mark.slow
 def test_long_tables_are_folded(run, tmp_path):
     def page(count):
         identifiers = {f"{number:03x}": IdentifierReport(5, 0, 0, 1e-3, 2e-3, 3e-3) for number in range(count)}
@@ -251,12 +259,14 @@ def test_ticks_keep_their_digits(single):
     assert "0.00" not in single.words
 
 
+@pytest.mark.slow
 def test_a_report_is_the_same_every_time_and_small(run, written, tmp_path):
     write_report([for_report(run, NAME)], tmp_path / "again.html")
     assert (tmp_path / "again.html").read_bytes() == written.read_bytes()
     assert written.stat().st_size < 1_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_runs_that_went_wrong_are_drawn_as_far_as_they_go(run, tmp_path):
     broken = [part[:400].copy() for part in run.trace.states]
@@ -279,6 +289,7 @@ def test_runs_that_went_wrong_are_drawn_as_far_as_they_go(run, tmp_path):
     assert page.text.count("FAILS —") == 4
 
 
+@pytest.mark.slow
 def test_a_link_over_which_nothing_was_used_has_no_ages(run, tmp_path):
     one = for_report(run, "run")
     unused = replace(one.summary.links[0], used=0, **dict.fromkeys(AGE_KEYS))

@@ -7,12 +7,13 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from echelon.bridge.reports import DrivesReport, FindingReport, RefereeReport, WheelsReport
+from echelon.bridge.referee_reports import FindingReport, RefereeReport
+from echelon.bridge.reports import DrivesReport, IntrusionReport, WheelsReport
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.scenario.tables import CheckName
 from echelon.sim.results.checks import CHECKS
-from echelon.sim.results.records import Summary
+from echelon.sim.results.records import RefusalResult, StandstillResult, Summary
 from echelon.sim.results.summary import summarise, summary_text
 from echelon.sim.results.trace import Trace
 from echelon.sim.results.verdict import CheckResult
@@ -24,6 +25,7 @@ NO_RECORDING = "health.off=['recording']"
 LIMIT = "robot.torque_limit=2.0"
 FINDING = RefereeReport(7, 0, {"gap": 1}, (FindingReport(2.5, "can0", "100", "gap", "late", "g1/r1"),), {})
 CLEAN = RefereeReport(7, 0, {}, (), {})
+INTRUSIONS = (IntrusionReport("can0", "10.0.0.7", "100", 12),)
 SILENT = RefereeReport(0, 0, {}, (), {})
 WHEELS = WheelsReport("native", 100, {}, 0.1, came_up=-0.5, enabled=True)
 
@@ -102,7 +104,19 @@ def closed(**robot: Any) -> Summary:
     return judged(trace, can=can_report(path="closed", robots=rows, referee=CLEAN))
 
 
+REFUSALS = (
+    RefusalResult("recorder", "g1/r1", "from the future", 2),
+    RefusalResult("g2", "g2/r4", "number sent before", 1),
+)
 UNUSED = {"used": 0, "age_mean_ns": 0.0}
+
+
+def stood_still(**lasted: float) -> Summary:
+    """A run on a wall clock in which processes stood still from 3 s on, for so many seconds."""
+    standstills = {name: StandstillResult(seconds, 3.0) for name, seconds in lasted.items()}
+    return judged(decaying(), run=run_facts(clock="wall", standstills=standstills))
+
+
 CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
     "whole": {
         "passed": (lambda: judged(decaying()), "the run reached 20 s of 20 s"),
@@ -151,11 +165,21 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
     },
     "refused": {
         "passed": (lambda: judged(decaying()), "no message was refused"),
-        "failed": (lambda: judged(decaying(), run=run_facts(refused=2)), "2 messages refused"),
+        "failed": (
+            lambda: judged(decaying(), run=run_facts(refused=3, refusals=REFUSALS)),
+            "3 messages refused: recorder 2 of g1/r1 (from the future), g2 1 of g2/r4 (number sent before)",
+        ),
     },
     "late": {
         "passed": (lambda: judged(decaying(), run=run_facts(clock="wall", stages=100, late_stages=10)), "10 of 100 stages"),
         "failed": (lambda: judged(decaying(), run=run_facts(clock="wall", stages=100, late_stages=11)), "11 of 100 stages"),
+    },
+    "standstill": {
+        "passed": (lambda: stood_still(g1=0.1, coordinator=0.05, recorder=3.0), "g1 for 0.1 s, the longest"),
+        "failed": (
+            lambda: stood_still(g1=2.0, bridge=0.11, coordinator=0.05),
+            "stood still: g1 for 2 s from t = 3 s on, bridge for 0.11 s from t = 3 s on; at most 0.1 s",
+        ),
     },
     "drives": {
         "passed": (lambda: closed(), "the drives of 9 robots came up"),
@@ -165,6 +189,13 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
         "passed": (lambda: judged(decaying()), "nothing breaks the contract in 7 frames"),
         "failed": (lambda: judged(decaying(), can=can_report(referee=FINDING)), "1 finding(s) on the bus"),
         "not tested": (lambda: judged(decaying(), can=can_report(frames=0, referee=SILENT)), "no frame was on the bus"),
+    },
+    "senders": {
+        "passed": (lambda: judged(decaying(), can=can_report(listen="candump vcan0")), "nobody else sent frames"),
+        "failed": (
+            lambda: judged(decaying(), can=can_report(listen="candump vcan0", intrusions=INTRUSIONS)),
+            "12 frames with identifiers of this run came from elsewhere: 10.0.0.7 sent 100 on can0, 12 times",
+        ),
     },
     "recording": {
         "passed": (lambda: judged(decaying()), "the recording lacks nothing"),
@@ -307,6 +338,15 @@ def test_what_bridge_and_drives_refused_counts(place):
     assert (check.outcome, check.measured) == ("failed", 3.0)
 
 
+def test_what_was_refused_is_in_the_text_by_receiver_source_and_reason():
+    trace = decaying()
+    summary = summarise(trace, counted(trace.plan), None, run_facts(refused=3, refusals=REFUSALS))
+    text = summary_text(summary)
+    assert "  refused  2 messages of g1/r1 by recorder: from the future" in text
+    assert "  refused  1 message of g2/r4 by g2: number sent before" in text
+    assert [check.about for check in summary.verdict.checks if check.name == "refused"] == [("g1/r1", "g2/r4")]
+
+
 def test_a_claim_that_fails_fails_the_verdict_though_all_is_healthy():
     trace = decaying(0.1)
     claiming = plan_of("lab", "duration=20.0", CLAIM.replace("5.0", "1.0"))
@@ -316,3 +356,22 @@ def test_a_claim_that_fails_fails_the_verdict_though_all_is_healthy():
     holding = judged(Trace(plan_of("lab", "duration=20.0", CLAIM), trace.times_ns, trace.states)).verdict
     assert holding.word == "HOLDS"
     assert holding.sentence == "HOLDS: 1 claim and 10 checks passed, 1 not tested"
+
+
+def test_without_a_bus_a_standstill_is_bounded_by_silence_and_in_virtual_time_there_is_none():
+    facts = run_facts(clock="wall", standstills={"g1/r1": StandstillResult(0.4, 1.0)})
+    assert only(judged(decaying(), run=facts), "standstill").outcome == "failed"
+    assert only(judged(decaying(), run=facts, can=None), "standstill").outcome == "passed"
+    assert not [check for check in judged(decaying()).verdict.checks if check.name == "standstill"]
+
+
+def test_a_recording_that_was_thinned_by_rule_lacks_nothing_but_what_its_rule_keeps():
+    whole = decaying()
+    thinned = whole
+    for robot in range(len(whole.plan.robots)):
+        thinned = without(thinned, robot, np.arange(len(whole.times_ns[robot])) % 5 != 0)
+    facts = run_facts(recorded_every=0.05, thinned=14_400)
+    check = only(judged(thinned, run=facts), "recording")
+    assert (check.outcome, check.text[:37]) == ("passed", "thinned by rule, to an instant every ")
+    lacking = without(thinned, 3, slice(10, 12))
+    assert "lacks 2 states (2 of g2/r4" in only(judged(lacking, run=facts), "recording").text

@@ -92,6 +92,7 @@ def test_a_lag_is_no_growth_and_nothing_fails():
     assert verdict.word == "HEALTHY", verdict.reasons
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beyond", [0, 4])
 def test_runs_grow_where_the_analysis_of_the_sampled_loop_says_so_and_only_there(beyond):
     plan = plan_of("lab", "claims=[]")

@@ -59,6 +59,7 @@ def test_percentiles_are_latencies_that_a_share_does_not_exceed(plan: Plan, tmp_
         assert value == np.sort(took)[round(share * 1000) - 1] / 1e9
 
 
+@pytest.mark.slow
 def test_tables_and_json(plan: Plan, tmp_path: Path) -> None:
     found = latencies_of(plan, tmp_path, [(0, 0, 0, 5 * MS), (0, 1, 10 * MS, 12 * MS), (2, 1, 11 * MS, 12 * MS)])
     table = found.table

@@ -6,7 +6,8 @@ from math import exp, log, sqrt
 import numpy as np
 import pytest
 
-from echelon.bridge.reports import BusEvent, BusReport, FindingReport, RefereeReport, ScheduledEvent
+from echelon.bridge.referee_reports import FindingReport, RefereeReport
+from echelon.bridge.reports import BusEvent, BusReport, ScheduledEvent
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.can_lines import can_lines, finding_text
 from echelon.sim.results.distances import distances

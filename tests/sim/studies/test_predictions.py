@@ -95,6 +95,17 @@ def test_other_values_are_searched_for() -> None:
     assert boundary(lossy, [exact + 0.05, 0.99]) == (None, True)
 
 
+@pytest.mark.parametrize("delay", [0.005, 0.01, 0.015])
+def test_losses_are_judged_at_delays_between_two_periods_too(delay: float) -> None:
+    def lossy(loss: float) -> Plan:
+        return plan_of("lab", f'links=[{{channel="state",delay={delay},loss={loss}}}]')
+
+    exact = mean_square(lossy(0.0), Channel.STATE).loss
+    assert exact is not None
+    assert stable(lossy(exact - 0.005))
+    assert stable(lossy(exact + 0.005)) is False
+
+
 def test_what_cannot_be_predicted_is_not_guessed() -> None:
     def jittery(value: float) -> Plan:
         return plan_of("lab", UPLINK, f"links.up.delay={{min=0.0,max={value!r}}}")

@@ -37,7 +37,7 @@ def sweep_command(*arguments: str | Path, before: str = "") -> subprocess.Comple
     """Runs `echelon sweep` in a process of its own, after some lines of Python."""
     code = f"import sys\n{before}\nfrom echelon.cli import main\nsys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "sweep", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=ROOT)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=ROOT)
 
 
 def kill_after(tasks: int, torn: bool) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import threading
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from echelon.runtime.link import LinkCounts
 from echelon.sim.processes.outcome import Progress
 from echelon.sim.view import live
 from echelon.sim.view.live import Display
-from support.runs import plan_of
+from support.runs import plan_of, until
 
 PLAN = plan_of("paper")
 
@@ -75,6 +76,7 @@ def test_a_note_is_told_once_and_at_once() -> None:
     display = Display(PLAN, stream, quiet=True)
     for note in ("stalled", "stalled", "goes on", "goes on"):
         display.show(Progress(note=note))
+    display.close()
     assert stream.getvalue().splitlines() == ["stalled", "goes on"]
 
 
@@ -113,6 +115,31 @@ def test_the_table_has_the_links_if_they_are_late() -> None:
         text = " ".join(re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue()).split())
         for name in ("up", "command"):
             assert (f"{name} 900 180 90 27 1e-09 2e-09 0.04 0.08" in text) == there
+
+
+class Stopped(io.StringIO):
+    """A terminal that is stopped (Ctrl-S), or a pipe that is full and that nobody reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.go_on = threading.Event()
+
+    def write(self, text: str) -> int:
+        self.go_on.wait()
+        return super().write(text)
+
+
+def test_who_shows_does_not_wait_for_a_terminal_that_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "CLOSE_S", 0.1)
+    stream = Stopped()
+    display = Display(PLAN, stream)
+    for number in range(3):
+        display.say(f"line {number}")
+        display.show(progress_with({}))
+    display.close()
+    assert stream.getvalue() == ""
+    stream.go_on.set()
+    assert until(lambda: "line 2" in stream.getvalue())
 
 
 def test_quiet_in_a_terminal_leaves_it_alone() -> None:

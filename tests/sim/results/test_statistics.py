@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from echelon.sim.sweep.statistics import NORMAL, median, moment_growth, runs_needed, wilson
+from echelon.sim.results.statistics import NORMAL, median, moment_growth, runs_needed, wilson
 
 
 @pytest.mark.parametrize(("holds", "runs"), [(0, 1), (1, 1), (3, 10), (50, 50), (7999, 8000), (0, 64), (37, 64)])

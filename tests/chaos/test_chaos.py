@@ -1,0 +1,45 @@
+"""`make chaos` in short: twenty plans, each with one hit on a small run, judged by the checker that shares no code with it."""
+
+from pathlib import Path
+
+import pytest
+
+from chaos import room
+from chaos.__main__ import carry_out_apart, repeat
+from chaos.plans import KINDS, TRAFFIC, ChaosPlan, draw
+from support.vcan import vcan_required
+
+pytestmark = pytest.mark.slow
+
+PLANS = 20
+
+
+@pytest.fixture(scope="module")
+def references(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Returns the folder of undisturbed runs."""
+    return tmp_path_factory.mktemp("references")
+
+
+def chosen() -> list[ChaosPlan]:
+    """Returns the plans: of each kind of hit the first on each clock, and whatever comes until there are enough."""
+    plans = [draw(seed, short=True) for seed in range(300)]
+    first = {(plan.hits[0].kind, plan.clock): plan for plan in reversed(plans)}
+    others = [plan for plan in plans if plan not in first.values()]
+    return sorted([*first.values(), *others][:PLANS], key=lambda plan: plan.seed)
+
+
+def test_the_plans_are_of_all_kinds() -> None:
+    assert {(plan.hits[0].kind, plan.clock) for plan in chosen()} == {
+        (kind, clock) for kind in KINDS for clock in ("virtual", "wall")
+    }
+    assert {plan.path for plan in chosen()} == {"mirror", "closed"}
+    assert len(chosen()) == PLANS
+
+
+@pytest.mark.parametrize("plan", chosen(), ids=str)
+def test_a_run_keeps_its_promises_whatever_is_done_to_it(plan: ChaosPlan, tmp_path: Path, references: Path) -> None:
+    if plan.needs_room and (why := room.why_none()) is not None and plan.hits[0].kind in TRAFFIC:
+        assert not vcan_required(), why
+        pytest.skip(f"NOT TESTED: nothing can be sent from another host, no network namespace can be made here: {why}")
+    found = carry_out_apart(plan, tmp_path / "plan", references, KINDS, True)
+    assert found.violations == [], f"{plan}\nagain: {repeat(plan, KINDS, True)}"

@@ -1,0 +1,69 @@
+"""What is estimated from runs agrees with what is exact; plans without chance, for what is exact there alone."""
+
+import numpy as np
+import pytest
+
+from echelon.controller.prediction.largest_delay import largest_extra_delay
+from echelon.controller.prediction.linear_run import edges_of, later, ruled_links
+from echelon.controller.prediction.mean_square import Losses
+from echelon.messages import Channel
+from echelon.sim.forecast.estimating import Estimates
+from echelon.sim.forecast.own_links import OwnLinks, calm
+from support.runs import plan_of
+
+LOSSY = 'links=[{channel="state", loss=0.4}]'
+
+
+def test_the_rate_of_runs_is_that_of_the_second_moment() -> None:
+    plan = plan_of("lab", LOSSY, "duration=20")
+    rate, low, high = Estimates(plan, 32).growth(plan).rates()
+    H_s = plan.root.period_ns / 1e9
+    exact = -np.log(Losses(plan, (), None).radius(0.0)) / (2 * H_s)
+    assert rate is not None
+    assert low is not None
+    assert high is not None
+    assert low < rate < high
+    assert rate == pytest.approx(exact, rel=0.3)
+    assert OwnLinks(plan, Estimates(plan, 0)).verdict().rate == pytest.approx(exact, rel=1e-6)
+
+
+def test_late_references_of_a_formation_that_moves_are_no_growth() -> None:
+    plan = plan_of("lab", 'links=[{channel="state", loss=0.1}, {channel="command", delay=0.04}]', "duration=20")
+    found = Estimates(plan, 16).growth(
+        plan
+    )  # along the circle an error of 3 mm stays, which neither grows nor vanishes
+    assert found.high < 0.5
+
+
+def test_the_largest_delay_by_runs_is_the_exact_one() -> None:
+    plan = plan_of("lab", "duration=20")
+    edges = edges_of(plan, Channel.STATE)
+    exact = largest_extra_delay(plan, edges).seconds
+    assert exact is not None
+    found = Estimates(plan, 4).boundary(
+        lambda extra: later(plan, edges, round(extra * 1e9)), [by * exact for by in (0.0, 0.5, 1.0, 1.5)], 2
+    )
+    assert found.value is not None
+    assert found.value == pytest.approx(exact, rel=0.08)
+    assert found.high is not None
+    assert found.low is not None
+    assert found.low <= exact * 1.02
+    assert found.high >= exact * 0.98
+
+
+@pytest.mark.parametrize(
+    ("delay", "mean"),
+    [
+        ("{min=0.01, max=0.03}", 0.02),
+        ('{kind="gamma", min=0.005, shape=2.0, scale=0.004}', 0.013),
+        ('{kind="gamma", min=0.005, shape=2.0, scale=0.004, correlation=0.5}', 0.013),
+    ],
+)
+def test_delays_that_vary_take_their_mean(delay: str, mean: float) -> None:
+    plan = plan_of("lab", f'links=[{{channel="state", loss=0.1, delay={delay}}}]')
+    still, left_out = calm(plan)
+    assert left_out == "without losses, delays that vary at their mean"
+    for link in ruled_links(still, Channel.STATE):
+        assert link.steady
+        assert link.delay_min_ns == pytest.approx(mean * 1e9, rel=0.01)
+    assert calm(still) == (still, "")

@@ -143,10 +143,17 @@ class Member:
         for payload in self.near(payloads):
             self.receive(payload)
 
-    def join(self) -> None:
-        """Waits for the end of the run."""
+    def join(self) -> BaseException | None:
+        """Waits for the end of the run, and returns what it failed with."""
         self.thread.join(TIMEOUT_S)
         assert not self.thread.is_alive()
+        return self.failure
+
+    def stands(self) -> bool:
+        """Returns whether the role can't move before the observer reads: enough batches wait, or the main thread sends a batch
+        and the handler leaves the next stages to it."""
+        assert self.at_gate.wait(TIMEOUT_S)
+        return len(self.runner._copies.batches) == MAX_BATCHES or not self.runner._in_handler
 
     def watched(self) -> list[bytes]:
         """Returns the messages in the batches of copies."""
@@ -233,8 +240,7 @@ def test_a_stall_names_the_members_that_it_waits_for(monkeypatch: pytest.MonkeyP
 
     member.on_wait = on_wait
     member.thread.start()
-    member.join()
-    assert isinstance(member.failure, SystemExit)
+    assert isinstance(member.join(), SystemExit)
     assert member.waits == [(0, [plan.root.index]), (2 * plan.robots[0].period_ns, [second])]
     commands = of(messages, leader.index, Channel.COMMAND)[:2]
     groups = of(messages, leader.index, Channel.GROUP_STATE)[:2]
@@ -262,8 +268,7 @@ def test_garbage_is_counted_and_dropped() -> None:
                 shapeless += 1
         door(command)
         door(command)  # the second copy changes nothing
-    member.join()
-    assert member.failure is None
+    assert member.join() is None
     refused = member.runner.refusals.by_source()[plan.all_roles[robot.parent].name]
     assert sum(refused.values()) == member.runner.refusals.total == 6 * len(commands) + shapeless
     assert refused[OF_ANOTHER] == refused[AGAIN] == len(commands)
@@ -288,7 +293,7 @@ def test_an_observer_that_reads_nothing_blocks_the_role_and_loses_nothing(monkey
     assert member.batches == []
     member.watch_gate.set()
     member.feed(commands[MAX_AHEAD:])
-    member.join()
+    assert member.join() is None
     assert member.said == states
     assert member.watched() == states
 
@@ -302,12 +307,12 @@ def test_what_a_process_that_is_killed_has_not_sent_spans_less_than_a_fifth_of_a
     member.thread.start()
     feeder = threading.Thread(target=member.feed, args=(of(messages, robot.parent, Channel.COMMAND),), daemon=True)
     feeder.start()
-    assert until(lambda: len(member.runner._copies.batches) == MAX_BATCHES, TIMEOUT_S)  # type: ignore[union-attr]
+    assert until(member.stands, TIMEOUT_S)
     assert member.batches == []
     assert (len(member.said) + 1) * robot.period_ns < 200_000_000
     member.watch_gate.set()
     feeder.join()
-    member.join()
+    assert member.join() is None
     assert member.watched() == of(messages, robot.index, Channel.STATE)
 
 
@@ -319,7 +324,7 @@ def test_the_last_batch_is_sent_though_the_handler_ends_the_run() -> None:
         member.runner.finish = lambda: None  # type: ignore[method-assign]  # lockstep alone has to do it
         member.thread.start()
         member.feed(of(messages, robot.parent, Channel.COMMAND))
-        member.join()
+        assert member.join() is None
         assert member.watched() == of(messages, robot.index, Channel.STATE)
 
 
@@ -343,7 +348,7 @@ def test_receiving_never_waits_for_a_put_of_the_main_thread() -> None:
     assert not feeder.is_alive()
     member.data_gate.set()
     member.feed(commands[MAX_AHEAD:])
-    member.join()
+    assert member.join() is None
     assert member.said == of(messages, robot.index, Channel.STATE)
 
 
@@ -359,7 +364,7 @@ def test_a_role_whose_links_lose_everything_still_waits_for_its_sources(
     assert MAX_AHEAD <= len(member.said) <= MAX_AHEAD + 2
     assert member.waits[0][1] == [robot.parent]
     member.feed(of(messages, robot.parent, Channel.COMMAND))
-    member.join()
+    assert member.join() is None
     assert member.said == of(messages, robot.index, Channel.STATE)
 
 
@@ -379,8 +384,7 @@ def test_an_exception_in_a_stage_reaches_the_caller(at: int) -> None:
     member = Member(plan, stub)
     member.thread.start()
     member.feed(of(messages, robot.parent, Channel.COMMAND))
-    member.join()
-    assert isinstance(member.failure, ArithmeticError)
+    assert isinstance(member.join(), ArithmeticError)
     assert member.watched() == member.said == of(messages, robot.index, Channel.STATE)[:at]
 
 

@@ -1,6 +1,7 @@
 """What a session has received, until it is taken."""
 
 import threading
+import time
 from collections import deque
 from typing import Generic, TypeVar
 
@@ -26,10 +27,12 @@ class Inbox(Generic[_T]):
     def take(self, timeout_s: float | None = None) -> list[_T]:
         """Removes and returns all items.  If there are none, it first waits for one, at most `timeout_s`; None: for ever."""
         items = self._items
-        if not items and timeout_s != 0:
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        # `put` may set the event after its item was taken, so the event alone does not mean that there is an item.
+        while not items and timeout_s != 0:
             self._some.clear()  # cleared before the second look: an item that comes after it sets the event again
-            if not items:
-                self._some.wait(timeout_s)
+            if items or not self._some.wait(None if deadline_s is None else max(0.0, deadline_s - time.monotonic())):
+                break
         taken = [items.popleft() for _ in range(len(items))]
         self._room.set()
         return taken

@@ -64,6 +64,8 @@ class Child:
     waiting_for: list[int] = field(default_factory=list)
     waiting_ns: int = -1
     said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
+    ours: set[int] = field(default_factory=set)
+    """The numbers of the signals that the supervisor has sent to it"""
 
     @property
     def name(self) -> str:
@@ -95,7 +97,8 @@ class Child:
 
     def signal(self, number: int) -> None:
         """Sends a signal to the process, if it is alive."""
-        if self.handle >= 0:
+        if self.alive:
+            self.ours.add(number)
             try:
                 signal.pidfd_send_signal(self.handle, number)
             except ProcessLookupError:
@@ -135,6 +138,15 @@ class Child:
         if code is None:
             return "ended"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    @property
+    def was_killed(self) -> bool:
+        """Whether a signal ended the process that the supervisor has not sent."""
+        if self.alive:
+            return False
+        self.process.join(1.0)
+        code = self.process.exitcode
+        return code is not None and code < 0 and -code not in self.ours
 
     def runs(self) -> str:
         """Returns in words which users' parts the process runs; "" if none."""

@@ -9,7 +9,7 @@ from typing import Final
 from echelon.bridge.reports import CanReport
 from echelon.sim.processes.children import Child, last_words_of
 from echelon.sim.processes.contract import FINISHING
-from echelon.sim.processes.failures import DivergedError, RunError
+from echelon.sim.processes.failures import DivergedError, RunError, few
 from echelon.sim.processes.stalls import STALL_REPORT_S
 from echelon.sim.processes.to_process import End, Finish
 from echelon.sim.processes.to_supervisor import RecorderReport
@@ -158,3 +158,14 @@ def take_down(children: Sequence[Child]) -> None:
             child.ends_within(GRACE_S)
         child.process.join(0.2)  # if the fork server is there, it lets the process go
         child.close()
+
+
+def also_killed(children: Sequence[Child], failure: str) -> str:
+    """Returns the failure of a run, and after it the processes that others killed, if the failure does not name them."""
+    killed = [
+        f"{child.kind_and_name} ({child.ending()})"
+        for child in children
+        if child.done is None and child.was_killed and f"{child.kind_and_name} (" not in failure
+    ]
+    first, line, rest = failure.partition("\n")
+    return f"{first}; lost as well: {few(killed)}{line}{rest}" if killed else failure

@@ -9,8 +9,9 @@ breaking off   a failure in one of the above, or   has the bridge stop all wheel
 finishing      members are done or ended           sends `Finish` to bridge, drives, referee and recorder, one after the other
 taking down    all of them are done                sends `End`; kills what is left
 
-The modules beside this one: `specs` lists the processes and `children` starts them; `stalls` finds out who holds up a run;
-`endings` has the last three phases; `outcome` is what is told of a run, `failures` why it breaks off.
+The modules beside this one: `specs` lists the processes and `children` starts them; `hearing` reads what they say; `stalls`
+finds out who holds up a run; `endings` has the last three phases; `outcome` is what is told of a run, `failures` why it breaks
+off.
 
 All processes come from one fork server that has imported their modules, so fifteen start in the time of one.  No process
 outlives the supervisor: each notices the hang-up of its pipe and ends, even if the supervisor was killed; the bridge stops the
@@ -22,35 +23,23 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
-from echelon.runtime.admission import Refusals
 from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.observing import new_gate
 from echelon.sim.processes.children import Child, last_words_of, start, warm_up
 from echelon.sim.processes.contract import ProcessSpec
-from echelon.sim.processes.endings import finish_watchers, stop_members, stop_wheels, take_down
+from echelon.sim.processes.endings import also_killed, finish_watchers, stop_members, stop_wheels, take_down
 from echelon.sim.processes.failures import NAMED, DivergedError, RunError, StallError, few
+from echelon.sim.processes.hearing import Hearing
 from echelon.sim.processes.outcome import Outcome, Progress, outcome_of
 from echelon.sim.processes.pulse import Pulses
 from echelon.sim.processes.specs import list_specs
 from echelon.sim.processes.stalls import StallWatch, StandstillWatch
 from echelon.sim.processes.to_process import Start, Told
-from echelon.sim.processes.to_supervisor import (
-    Done,
-    Failed,
-    LinksProgress,
-    PartFailed,
-    Ready,
-    RecorderProgress,
-    Said,
-    Waiting,
-)
 
 START_TIMEOUT_S: Final = 90.0
 """How long processes may take to become ready [s]"""
@@ -60,8 +49,6 @@ WALL_OVERTIME_S: Final = 10.0
 """How long after the end of a run on a wall clock its members may take to be done [s]"""
 LOOK_S: Final = 0.1
 """Time between two looks at the processes, if none of them says anything [s]"""
-NOT_UNDERSTOOD: Final = "not understood"
-"""Why the supervisor refuses what a process says over its pipe"""
 SHOW_S: Final = 0.2
 """Time between two looks at the progress [s]"""
 GROUP_S: Final = 0.1
@@ -112,8 +99,7 @@ class Supervisor:
             list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going, gate, every_ns)
         )
         self._children: list[Child] = []
-        self.refusals = Refusals()
-        """What processes said over their pipes that is no message of theirs"""
+        self._hearing = Hearing(plan, self._children, self.progress)
         self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)
         self._still = StandstillWatch(plan, self._children, self.progress)
         self._asked, self._startup_s = interrupted, 0.0
@@ -128,9 +114,10 @@ class Supervisor:
         with ExitStack() as stack:
             if self._asked is None:
                 self._asked = stack.enter_context(interruption())
-            self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-            stack.callback(os.close, self._wake)
-            stack.enter_context(self._asked.during(Raises.NONE, lambda: os.eventfd_write(self._wake, 1)))
+            wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+            stack.callback(os.close, wake)
+            stack.enter_context(self._asked.during(Raises.NONE, lambda: os.eventfd_write(wake, 1)))
+            self._hearing.wake = wake
             self._pulses = Pulses(len(self._specs))
             stack.callback(self._pulses.close)
             return self._run()
@@ -155,18 +142,18 @@ class Supervisor:
         wall_s = max(0.0, time.monotonic() - begun_s) if begun_s else 0.0
         try:
             if broken:
-                stop_wheels(self._children, self._serve)
+                stop_wheels(self._children, self._hearing.serve)
                 if failure is not None:
                     failure = self._signalled() or failure
                     self.progress.note = failure.splitlines()[0]
                 standstills = self._standstills()
-                stop_members(self._children, self._serve)
+                stop_members(self._children, self._hearing.serve)
             else:
                 self.progress.phase = "finishing"
                 standstills = self._standstills()
             whole = self.virtual and not broken  # on a wall clock, messages may be lost on the way
             failure = finish_watchers(
-                self._children, self._serve, self._say, failure, whole, lambda: self._interruption.asked
+                self._children, self._hearing.serve, self._say, failure, whole, lambda: self._interruption.asked
             )
         except BaseException as other:
             error = error or other
@@ -178,10 +165,12 @@ class Supervisor:
         processes = [child.done for child in self._children if child.done is not None]
         outcome = outcome_of(self.plan, processes, failure, self._startup_s, wall_s)
         outcome.standstills = standstills
-        outcome.refused_here = self.refusals.by_source()
+        outcome.refused_here = self._hearing.refusals.by_source()
         common_ns = outcome.trace.common_ns()
         if stall is not None and len(common_ns):
             outcome.failure = stall.text(f"t = {common_ns[-1] / 1e9:g} s")
+        if outcome.failure is not None:
+            outcome.failure = also_killed(self._children, outcome.failure)
         return outcome
 
     def _until_members_are_done(self) -> None:
@@ -241,10 +230,10 @@ class Supervisor:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         shown_s = 0.0
         while not done():
-            self._serve(LOOK_S)
+            self._hearing.serve(LOOK_S)
             if self._interruption.asked or any(child.pulse.asked_by for child in self._children):
                 raise RunError("interrupted")
-            self._check_lost()
+            self._hearing.check_lost()
             now_s = time.monotonic()
             if self.progress.phase == "running" and not self.virtual:
                 self._still.check(time.monotonic_ns())
@@ -262,78 +251,6 @@ class Supervisor:
                 who = few([child.name + child.runs() for child in late])
                 raise RunError(f"{what} after {timeout_s:g} s: {who}{last_words_of(late[:NAMED])}")
 
-    def _serve(self, timeout_s: float) -> None:
-        """Waits up to `timeout_s` for messages, standard error or the end of any child, and reads what has come.
-
-        Raises RunError or DivergedError if a message says that the run cannot or should not go on."""
-        by_handle: dict[Any, Child] = {}
-        for child in self._children:
-            if not child.control.closed:
-                by_handle[child.control] = child
-            if not child.words.closed:
-                by_handle[child.words] = child
-        ends = [child.handle for child in self._children if child.done is None and child.handle >= 0]
-        for handle in wait([*by_handle, *ends, self._wake], timeout_s):
-            if isinstance(handle, Connection):
-                child = by_handle[handle]
-                if handle is child.words:
-                    child.hear_words()
-                else:
-                    self._hear(child)
-
-    def _hear(self, child: Child) -> None:
-        """Reads one message of a child.  Raises RunError or DivergedError, as `_serve` does."""
-        try:
-            said: Said = child.control.recv()
-        except (EOFError, OSError):
-            child.control.close()
-            return
-        except Exception:  # bytes that are no message of a process
-            self.refusals.count(child.name, NOT_UNDERSTOOD)
-            return
-        child.heard_s = time.monotonic()
-        progress = self.progress
-        match said:
-            case Ready():
-                child.ready = True
-            case Waiting():
-                child.waiting_ns, child.waiting_for = said.time_ns, list(said.sources)
-            case LinksProgress():
-                progress.hear_links(said.links)
-            case BridgeProgress() if child.spec.kind == "bridge":
-                progress.bridge = said
-            case BridgeProgress():
-                progress.drives = said
-            case RecorderProgress():
-                progress.hear(said)
-                if said.failure and progress.phase == "running":
-                    raise RunError(f"the recording failed: {said.failure}")
-                if said.lost is not None and progress.phase == "running":
-                    progress.phase = "stopping"
-                    raise DivergedError(said.lost.text(self.plan))
-            case Failed():
-                starting = progress.phase == "starting"
-                raise RunError(
-                    f"{child.kind_and_name} cannot start: {said.text}" if starting else f"{child.name}: {said.text}"
-                )
-            case PartFailed():
-                raise RunError(said.text)
-            case Done():
-                child.done = said
-            case _:
-                self.refusals.count(child.name, NOT_UNDERSTOOD)
-
-    def _check_lost(self) -> None:
-        """Raises RunError if a child has ended without its report."""
-        for child in self._children:
-            if child.done is None and not child.alive:
-                while not child.control.closed and child.control.poll():
-                    self._hear(child)
-                if child.done is None:
-                    if not child.words.closed:
-                        child.hear_words()
-                    raise RunError(f"lost {child.kind_and_name} ({child.ending()}){last_words_of([child])}")
-
     def _say(self, note: str) -> None:
         """Shows a note to the user."""
         self.progress.note = note
@@ -344,4 +261,4 @@ class Supervisor:
             try:
                 child.control.send(message)
             except OSError:
-                pass  # the process is lost; `_check_lost` reports it
+                pass  # the process is lost; `Hearing.check_lost` reports it

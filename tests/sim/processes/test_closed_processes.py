@@ -193,8 +193,11 @@ def test_a_bridge_that_stood_still_makes_up_for_nothing(wall_run: tuple[Popen[st
     stopped_ns, before = time.monotonic_ns(), listener.commands
     os.kill(bridge, signal.SIGCONT)
     listener.listen(stopped_ns + HALF_A_SECOND)
-    assert 10 < listener.commands - before < 75  # fifty periods; a hundred were missed
+    assert listener.commands - before < 75  # fifty periods; a hundred were missed
     limit_ns = stopped_ns + 600_000_000_000
+    while listener.commands - before <= 10:  # it goes on
+        assert time.monotonic_ns() < limit_ns
+        listener.listen(time.monotonic_ns() + HALF_A_SECOND)
     while min(listener.moving_ns) <= stopped_ns + HALF_A_SECOND:  # and the drives recover
         assert time.monotonic_ns() < limit_ns, listener.moving_ns
         listener.listen(time.monotonic_ns() + HALF_A_SECOND)

@@ -311,7 +311,7 @@ def test_whoever_stands_still_the_wheels_have_no_torque_without_reason(
     who: str, seconds: float | None, clock: tuple[str, str], tmp_path: Path
 ) -> None:
     """A bridge or drives that stand still on a wall clock end the run, others their part in it.  In virtual time all wait."""
-    with running(tmp_path, *clock, "--stall-timeout", "8") as (command, ear):
+    with running(tmp_path, *clock, "--stall-timeout", "6") as (command, ear):
         pid = whom(command, who)
         os.kill(pid, signal.SIGSTOP)
         at_s = time.time()

@@ -127,7 +127,7 @@ def test_links_of_every_kind_do_the_same_between_processes(tmp_path: Path) -> No
 
 def test_links_are_told_while_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes tell their links once a second; the run is long enough that none ends before."""
-    plan = plan_of("lab", "duration=100.0", 'links=[{channel="state",loss=0.5}]')
+    plan = plan_of("lab", "duration=25.0", 'links=[{channel="state",loss=0.5}]')
     seen: list[int] = []
     outcome = supervised(
         plan, tmp_path, show=lambda progress: seen.append(sum(each.sent for each in progress.links.values()))
@@ -316,16 +316,22 @@ def test_virtual_time_with_the_latencies_of_a_wall_clock_is_that_run(
     for other in others:
         other.start()
     try:
-        outcome = Supervisor(plan, tmp_path, run="wall", virtual=False).run()
+        for number in range(10):  # a machine that is busy elsewhere withholds most instants, now and then
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            outcome = Supervisor(plan, folder, run="wall", virtual=False).run()
+            assert outcome.failure is None
+            arrivals = read_arrivals(folder / "arrivals.bin", plan)
+            assert not arrivals.damaged
+            assert sorted(arrivals.ends_ns) == [one.index for one in plan.formation]
+            recorded, same = equal_states(outcome.trace, trace_of(with_traces(plan, arrivals)))
+            assert recorded == same
+            if recorded > 300:
+                break
     finally:
         for other in others:
             other.kill()
-    assert outcome.failure is None
-    arrivals = read_arrivals(tmp_path / "arrivals.bin", plan)
-    assert not arrivals.damaged
-    assert sorted(arrivals.ends_ns) == [one.index for one in plan.formation]
-    recorded, same = equal_states(outcome.trace, trace_of(with_traces(plan, arrivals)))
-    assert recorded == same > 300
+    assert recorded > 300
     assert equal_states(outcome.trace, trace_of(plan))[1] < same  # without these latencies it is another run
 
 
@@ -355,6 +361,23 @@ def test_a_lost_robot_ends_the_run_by_name(long_run: tuple[Popen[str], Path]) ->
     summary = summary_of(folder)
     assert any("lost robot g2/r5" in reason for reason in reasons(summary))
     assert len(read_trace(folder / "run.mcap", plan_of("paper", "duration=1000")).times_ns[0]) > 10
+
+
+def test_all_that_were_killed_are_named(tmp_path: Path) -> None:
+    killed = list[int]()
+
+    def watch(progress: Progress) -> None:
+        if progress.time_ns > 200_000_000 and not killed:
+            killed.extend(pid_of(name, descendants(os.getpid())) for name in ("g1/r1", "g3", "g2/r5"))
+            for pid in killed:
+                os.kill(pid, signal.SIGKILL)
+
+    outcome = Supervisor(plan_of("paper", "duration=1000.0"), tmp_path, run="killed", virtual=True, show=watch).run()
+    assert outcome.failure is not None
+    first, _, others = outcome.failure.partition("; lost as well: ")
+    assert first.startswith("lost ")
+    said = {first.removeprefix("lost "), *others.split(", ")}
+    assert said == {f"{who} (killed by SIGKILL)" for who in ("robot g1/r1", "leader g3", "robot g2/r5")}
 
 
 def test_last_words_of_a_process_that_fails(tmp_path: Path) -> None:

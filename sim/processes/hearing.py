@@ -1,0 +1,109 @@
+"""What the supervisor hears: messages over the pipes of its children, their standard error, and their ends."""
+
+import time
+from multiprocessing.connection import Connection, wait
+from typing import Any, Final
+
+from echelon.bridge.reports import BridgeProgress
+from echelon.plan.plan import Plan
+from echelon.runtime.admission import Refusals
+from echelon.sim.processes.children import Child, last_words_of
+from echelon.sim.processes.failures import DivergedError, RunError
+from echelon.sim.processes.outcome import Progress
+from echelon.sim.processes.to_supervisor import (
+    Done,
+    Failed,
+    LinksProgress,
+    PartFailed,
+    Ready,
+    RecorderProgress,
+    Said,
+    Waiting,
+)
+
+NOT_UNDERSTOOD: Final = "not understood"
+"""Why the supervisor refuses what a process says over its pipe"""
+
+
+class Hearing:
+    """Reads what children say, and notes it in them and in the progress of the run.
+
+    `children` may become more.  `wake` is a handle that ends a wait when it is readable, as a signal makes it."""
+
+    def __init__(self, plan: Plan, children: list[Child], progress: Progress) -> None:
+        self._plan, self._children, self._progress = plan, children, progress
+        self.wake = -1
+        self.refusals = Refusals()
+        """What processes said over their pipes that is no message of theirs"""
+
+    def serve(self, timeout_s: float) -> None:
+        """Waits up to `timeout_s` for messages, standard error or the end of any child, and reads what has come.
+
+        Raises RunError or DivergedError if a message says that the run cannot or should not go on."""
+        by_handle: dict[Any, Child] = {}
+        for child in self._children:
+            if not child.control.closed:
+                by_handle[child.control] = child
+            if not child.words.closed:
+                by_handle[child.words] = child
+        ends = [child.handle for child in self._children if child.done is None and child.handle >= 0]
+        for handle in wait([*by_handle, *ends, self.wake], timeout_s):
+            if isinstance(handle, Connection):
+                child = by_handle[handle]
+                if handle is child.words:
+                    child.hear_words()
+                else:
+                    self._hear(child)
+
+    def _hear(self, child: Child) -> None:
+        """Reads one message of a child.  Raises RunError or DivergedError, as `serve` does."""
+        try:
+            said: Said = child.control.recv()
+        except (EOFError, OSError):
+            child.control.close()
+            return
+        except Exception:  # bytes that are no message of a process
+            self.refusals.count(child.name, NOT_UNDERSTOOD)
+            return
+        child.heard_s = time.monotonic()
+        progress = self._progress
+        match said:
+            case Ready():
+                child.ready = True
+            case Waiting():
+                child.waiting_ns, child.waiting_for = said.time_ns, list(said.sources)
+            case LinksProgress():
+                progress.hear_links(said.links)
+            case BridgeProgress() if child.spec.kind == "bridge":
+                progress.bridge = said
+            case BridgeProgress():
+                progress.drives = said
+            case RecorderProgress():
+                progress.hear(said)
+                if said.failure and progress.phase == "running":
+                    raise RunError(f"the recording failed: {said.failure}")
+                if said.lost is not None and progress.phase == "running":
+                    progress.phase = "stopping"
+                    raise DivergedError(said.lost.text(self._plan))
+            case Failed():
+                starting = progress.phase == "starting"
+                raise RunError(
+                    f"{child.kind_and_name} cannot start: {said.text}" if starting else f"{child.name}: {said.text}"
+                )
+            case PartFailed():
+                raise RunError(said.text)
+            case Done():
+                child.done = said
+            case _:
+                self.refusals.count(child.name, NOT_UNDERSTOOD)
+
+    def check_lost(self) -> None:
+        """Raises RunError if a child has ended without its report."""
+        for child in self._children:
+            if child.done is None and not child.alive:
+                while not child.control.closed and child.control.poll():
+                    self._hear(child)
+                if child.done is None:
+                    if not child.words.closed:
+                        child.hear_words()
+                    raise RunError(f"lost {child.kind_and_name} ({child.ending()}){last_words_of([child])}")

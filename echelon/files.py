@@ -53,6 +53,12 @@ def write_text(path: Path, text: str, durable: bool = False) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def write_new(path: Path, text: str) -> None:
+    """Writes a text file that was not there.  Raises OSError, also if there is one or a link."""
+    with path.open("x", encoding="utf-8") as file:
+        file.write(text)
+
+
 def read_json(data: str | bytes) -> Any:
     """Returns what a JSON text from outside says.  Raises ValueError if it is none, or nested too deep."""
     try:

@@ -2,6 +2,7 @@
 run again from there."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -65,8 +66,8 @@ def _copied(source: Source, folder: Path, taken: set[str]) -> str:
     while True:
         target = folder / (path.name if count == 1 else f"{path.stem}-{count}{path.suffix}")
         if target.name not in taken:
-            if not target.exists():
-                target.write_bytes(data)
+            with suppress(FileExistsError), target.open("xb") as file:
+                file.write(data)
                 return target.name
             if target.is_file() and target.read_bytes() == data:
                 return target.name

@@ -34,7 +34,7 @@ class CanLog:
     After it is open, no method raises. On a full disk, whole lines are dropped: `counts.lost` counts them and `error` holds
     the last error. Writing goes on when there is room again.
 
-    Parameters: `path` of the file, which is overwritten; `channel`, the name of the bus; `epoch_ns`, the wall-clock time of
+    Parameters: `path` of the file, which must not exist; `channel`, the name of the bus; `epoch_ns`, the wall-clock time of
     run time zero [ns since 1970]. Raises OSError if the file cannot be opened, ValueError if the channel is not one word."""
 
     __slots__ = ("_channel", "_epoch_ns", "_fd", "_flushed_ns", "_lines", "_size", "counts", "error")
@@ -42,7 +42,7 @@ class CanLog:
     def __init__(self, path: Path, channel: str, epoch_ns: int = EPOCH_NS) -> None:
         if channel.split() != [channel]:
             raise ValueError(f"the channel must be one word, not {channel!r}")
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         self._channel = channel
         self._epoch_ns = epoch_ns
         self._lines: list[str] = []

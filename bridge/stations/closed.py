@@ -18,6 +18,7 @@ from echelon.bridge.stations.rail import Rail, on_bus
 from echelon.bridge.timing.buses import bus_report, scheduled
 from echelon.bridge.timing.fit import plan_fit
 from echelon.errors import PartRunError
+from echelon.files import write_new
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.role import Stage
@@ -46,7 +47,7 @@ class ClosedBridge(Bridge):
         self.url = ", ".join(self.urls) or "nowhere"
         self.rail = Rail(self.buses)
         for bus, name in enumerate(dbc_names(plan)):
-            (folder / name).write_text(plan_dbc(plan, bus), encoding="utf-8")
+            write_new(folder / name, plan_dbc(plan, bus))
         self._names = [bus.name for bus in plan.can.buses]
         self._log = CanLog(folder / LOG, self._names[0])
         self.frames = 0

@@ -21,6 +21,7 @@ from echelon.bridge.stations.waiting import AT_ONCE, RunClock, drained
 from echelon.bridge.timing.bus_load import bus_load
 from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
+from echelon.files import write_new
 from echelon.messages import STATE_FIELDS, Channel, Message
 from echelon.plan.plan import Plan
 
@@ -59,7 +60,7 @@ class MirrorBridge(Bridge):
             self._spoken[robot.drive.bus].update(frame.can_id for frame in frames)
         self.url = ", ".join(bus.url for bus in self._buses)
         for number, name in enumerate(dbc_names(plan)):
-            (folder / name).write_text(plan_dbc(plan, number), encoding="utf-8")
+            write_new(folder / name, plan_dbc(plan, number))
         self._log = CanLog(folder / "can.log", plan.can.buses[0].name)
         self._bus_of = [robot.drive.bus for robot in plan.robots]
         self._names = [bus.name for bus in plan.can.buses]

@@ -35,7 +35,9 @@ class ArrivalFile:
 
     def __init__(self, folder: Path) -> None:
         """Opens the file in the folder of a run, and makes it if it is not there.  Raises OSError."""
-        self._file = os.open(folder / FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._file = os.open(
+            folder / FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644
+        )
         self._path = folder / FILE
 
     def write(self, records: bytes) -> None:

@@ -110,7 +110,7 @@ class Supervisor:
         Raises OSError if the file of arrivals cannot be made.  Other errors, which would be faults of this program or of
         `show`, are raised after all processes have ended."""
         if self._notes_arrivals:
-            (self._folder / ARRIVALS).write_bytes(b"")  # members append to it
+            (self._folder / ARRIVALS).open("xb").close()  # members append to it
         with ExitStack() as stack:
             if self._asked is None:
                 self._asked = stack.enter_context(interruption())

@@ -59,12 +59,12 @@ class ChunkedFile:
     def __init__(
         self, path: Path, attachments: dict[str, bytes], metadata: dict[str, str], topics: dict[str, str]
     ) -> None:
-        """Creates the file and writes its beginning.  Raises OSError if it cannot be created.
+        """Creates the file and writes its beginning.  Raises OSError if it cannot be created: also if there is one.
 
         `topics` maps topics to types; channels are numbered from 1 in this order."""
         self.failure: str | None = None
         self._path = path
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         # the lock tells other processes that the file is being written, until this process ends
         with suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from echelon.runtime.arrivals import FILE, RECORD, ArrivalFile, pack_arrival
+from support.full_disk import fill
 
 
 def test_members_append_to_one_file(tmp_path: Path) -> None:
@@ -18,8 +19,8 @@ def test_members_append_to_one_file(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_told_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / FILE).symlink_to("/dev/full")
     file = ArrivalFile(tmp_path)
+    fill(file._file)
     for _ in range(3):
         file.write(pack_arrival(0, 0, 0, 0))
     file.close()

@@ -13,6 +13,7 @@ import pytest
 
 from echelon.bridge.can.canlog import FLUSH_NS, CanLog
 from echelon.bridge.protocols.native.codec import NativeCodec, frame_id
+from support.full_disk import fill
 from support.runs import ROOT, lab_dbc
 
 EPOCH = 1_700_000_000_000_000_000
@@ -103,14 +104,25 @@ def test_log2asc_reads_it(tmp_path: Path) -> None:
     )
 
 
-def test_full_device_is_counted_not_raised() -> None:
-    with CanLog(Path("/dev/full"), "vcan0", 0) as log:
+def test_full_device_is_counted_not_raised(tmp_path: Path) -> None:
+    with CanLog(tmp_path / "can.log", "vcan0", 0) as log:
+        fill(log._fd)
         log.write(0, 1, DATA, 0)
         log.flush()
         assert log.error is not None
         assert log.error.strerror == os.strerror(28)
         log.write(1, 1, DATA, 0)
     assert (log.counts.written, log.counts.lost) == (0, 2)
+
+
+@pytest.mark.parametrize("there", ["file", "link"])
+def test_what_is_there_already_is_never_written_over(there: str, tmp_path: Path) -> None:
+    path, kept = tmp_path / "can.log", tmp_path / "kept"
+    kept.write_text("kept")
+    path.write_text("kept") if there == "file" else path.symlink_to(kept)
+    with pytest.raises(FileExistsError):
+        CanLog(path, "vcan0", 0)
+    assert path.read_text() == kept.read_text() == "kept"
 
 
 def test_file_stays_whole_when_the_disk_fills_and_goes_on_after(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_what_python_can_writes_is_read(suffix: str, channel: str, packed: bool,
 def test_log2asc_reads_the_log_of_a_run_right(tmp_path: Path) -> None:
     """In a log that begins at 0 it gives all frames of the first second the time 0."""
     for begin_ns in (0, -700_000_000):
-        path = tmp_path / "can.log"
+        path = tmp_path / f"can-{begin_ns}.log"
         with CanLog(path, "can0") as log:
             for time_ns, (can_id, data, remote) in FRAMES:
                 log.write(begin_ns + 5 * time_ns, can_id, data, 0, remote=remote)

@@ -210,8 +210,9 @@ def test_the_same_run_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(chunked, "CHUNK_SIZE", 20_000)
     contents = set()
     for flush_every in (0, 1, 7, 100):
-        record(tmp_path / "run.mcap", flush_every=flush_every)
-        contents.add((tmp_path / "run.mcap").read_bytes())
+        path = tmp_path / f"run-{flush_every}.mcap"
+        record(path, flush_every=flush_every)
+        contents.add(path.read_bytes())
     assert len(contents) == 1
 
 
@@ -253,7 +254,7 @@ def test_at_no_instant_more_than_a_fifth_of_a_second_is_missing_on_disk(tmp_path
 
 def test_a_chunk_shorter_than_what_stood_there_provisionally(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No bytes of the longer provisional chunk remain."""
-    path, poor = tmp_path / "run.mcap", iter([True])
+    poor = iter([True])
     good = zstandard.ZstdCompressor(level=chunked.LEVEL)
 
     class Improving:
@@ -262,6 +263,7 @@ def test_a_chunk_shorter_than_what_stood_there_provisionally(tmp_path: Path, mon
 
     contents = []
     for flush in (False, True):
+        path = tmp_path / f"run-{flush}.mcap"
         with closing(Recorder(path, paper(), SCENARIO, METADATA)) as recorder:
             if flush:
                 monkeypatch.setattr(recorder._file, "_compressor", Improving())
@@ -392,11 +394,24 @@ def test_a_finished_chunk_is_not_written_again_when_the_disk_fills_up(
     assert times == [1_000_000 * tick for tick in range(len(times))]
 
 
-def test_a_disk_that_is_full_from_the_start() -> None:
-    with closing(Recorder(Path("/dev/full"), paper(), SCENARIO, METADATA)) as recorder:
+def test_a_disk_that_is_full_from_the_start(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with disk_of(0), closing(Recorder(path, paper(), SCENARIO, METADATA)) as recorder:
         for message in invented(paper(), 3):
             recorder.record(message)
-    assert recorder.failure == "/dev/full: No space left on device; the recording ends early"
+    assert recorder.failure is not None
+    assert recorder.failure.startswith(f"{path}: ")
+    assert recorder.failure.endswith("; the recording ends early")
+
+
+@pytest.mark.parametrize("there", ["file", "link"])
+def test_what_is_there_already_is_never_written_over(there: str, tmp_path: Path) -> None:
+    path, kept = tmp_path / "run.mcap", tmp_path / "kept"
+    kept.write_text("kept")
+    path.write_text("kept") if there == "file" else path.symlink_to(kept)
+    with pytest.raises(FileExistsError):
+        Recorder(path, paper(), SCENARIO, METADATA)
+    assert path.read_text() == kept.read_text() == "kept"
 
 
 def test_close_twice(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def parse(text: str, name: str, overrides: Sequence[str], registry: Registry, fo
     """Returns the scenario and the plan of a TOML text.  Raises ScenarioError.
 
     Errors call the file `name`.  Files of parts are relative to `folder`."""
-    table = _table(text, name)
+    table = read_table(text, name)
     if not table and not overrides:
         needed = [key for key, field in Scenario.model_fields.items() if field.is_required()]
         raise ScenarioError(f"{name}: empty; a scenario needs {', '.join(needed)}")
@@ -103,8 +103,15 @@ def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None
     return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True, context=names))
 
 
-def _table(text: str, name: str) -> dict[str, Any]:
+_PARTS: Final = 1000
+"""The largest number of parts that a key may have.  For a longer one tomllib takes time by the square of its length."""
+_BETWEEN_KEYS: Final = re.compile(r"[=,\n\[\]{}]")
+
+
+def read_table(text: str, name: str) -> dict[str, Any]:
     """Returns TOML text as a table.  Raises ScenarioError."""
+    if any(one.count(".") >= _PARTS for one in _BETWEEN_KEYS.split(text)):
+        raise ScenarioError(f"{name}: not TOML that can be read: a key of {_PARTS} parts or more")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -1,10 +1,10 @@
 """The report about one run or several: one HTML file, without scripts, that needs no network and can be printed."""
 
-import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from echelon.files import write_text
+from echelon.planning.loading import ScenarioError, read_table
 from echelon.sim.report import sections
 from echelon.sim.report.against import measured
 from echelon.sim.report.comparison import WIDTH, Compared, comparison
@@ -110,8 +110,8 @@ def _comparison(shown: Sequence[ShownRun]) -> list[str]:
 def _description(scenario: str) -> str:
     """Returns the description in a scenario (TOML); empty if there is none."""
     try:
-        return str(tomllib.loads(scenario).get("description", ""))
-    except tomllib.TOMLDecodeError:
+        return str(read_table(scenario, "").get("description", ""))
+    except ScenarioError:
         return ""
 
 

@@ -23,8 +23,9 @@ def test_nothing_is_found_where_all_keep_the_contract(
     path, plan = one_robot(tmp_path, protocol, watchdog=5.0)
     with LiveRobot(plan, URL) as robot:
         assert robot.enabled.wait(60.0)
-        assert main(["referee", str(path), "--seconds", "2", "--json", *LATE]) == 0  # vcan0 is what `auto` takes
+        code = main(["referee", str(path), "--seconds", "2", "--json", *LATE])  # vcan0 is what `auto` takes
         summary = json.loads(capsys.readouterr().out)
+        assert (code, summary["findings"]) == (0, [])
         assert main(["can", str(path), "--can", URL, "--seconds", "2.5", "--json"]) == 0
         shot = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (summary["kinds"], summary["unknown"]) == ({}, 0)

@@ -15,6 +15,8 @@ _REMOTE = 0x40000000  # CAN_RTR_FLAG
 _OTHER = 0xA0000000  # CAN_EFF_FLAG | CAN_ERR_FLAG: frames with 29-bit identifiers, and messages of the controller
 _STANDARD = struct.pack("=II", 0, 0x80000000)  # struct can_filter: all frames with 11-bit identifiers
 _DATAGRAM = 4096  # largest datagram that is read [bytes]; one with a frame has about 160
+_HEAD = 48  # bytes at the beginning of a datagram, with the identifier among them
+_KNOWN = 1024  # kinds of frames on a bus, at most
 _BUFFER = 4 << 20
 _GONE = (errno.ENXIO, errno.ENODEV)
 _SO_ATTACH_FILTER = 26
@@ -117,6 +119,9 @@ class Datagrams:
         self.send: Callable[[bytes, int], int] = self._send_to
         self.mend(None)
         self._parts: dict[tuple[int, int, bool], tuple[bytes, bytes]] = {}
+        self._heard: dict[tuple[bytes, int], tuple[bytes, bytes, int, bool]] = {}
+        """By the first bytes and the size of a datagram that has come: the bytes around its data, the identifier, and whether
+        it is a remote frame.  Only datagrams as `encode` makes them are here; no more than `_KNOWN`"""
 
     def _join(self) -> None:
         group, port = self._target
@@ -153,8 +158,23 @@ class Datagrams:
             parts = self._parts[key] = _around_data(*key)
         return parts[0] + data + parts[1]
 
+    def decode(self, payload: bytes) -> tuple[int, bytes, bool] | None:
+        """Returns what `unpack` does.  A datagram that differs from an earlier one in its data alone is not unpacked again."""
+        heard = self._heard.get((payload[:_HEAD], len(payload)))
+        if heard is not None:
+            before, after, can_id, remote = heard
+            if payload.startswith(before) and payload.endswith(after):
+                return can_id, payload[len(before) : len(payload) - len(after)], remote
+        frame = self.unpack(payload)
+        if frame is not None and len(self._heard) < _KNOWN:
+            can_id, data, remote = frame
+            before, after = _around_data(can_id, len(data), remote)
+            if payload == before + data + after:
+                self._heard[payload[:_HEAD], len(payload)] = before, after, can_id, remote
+        return frame
+
     @staticmethod
-    def decode(payload: bytes) -> tuple[int, bytes, bool] | None:
+    def unpack(payload: bytes) -> tuple[int, bytes, bool] | None:
         """Returns identifier, data, and whether it is a remote frame; None for a frame that is not a classic 11-bit one.
 
         A foreign datagram may make python-can raise any exception."""
@@ -221,7 +241,7 @@ class Outside:
             except OSError:
                 return
             try:
-                frame = Datagrams.decode(payload)
+                frame = Datagrams.unpack(payload)
             except Exception:
                 continue
             if frame is not None:

@@ -7,6 +7,8 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from random import Random
 from typing import Any
 
 import can
@@ -17,7 +19,7 @@ from hypothesis import strategies as st
 
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.can.bus_url import interface_is_up, listen_command, resolve_url
-from echelon.bridge.can.wires import RawCan
+from echelon.bridge.can.wires import Datagrams, RawCan
 
 FRAMES = [(0x100 + number % 9, number.to_bytes(8, "little")) for number in range(500)]
 
@@ -431,3 +433,39 @@ def test_an_interface_that_goes_down_or_away_is_survived() -> None:
     assert bus.counts.failed == 3
     assert isinstance(bus.error, OSError)
     bus.close()
+
+
+def said_of(take: Callable[[bytes], object], payload: bytes) -> object:
+    """Returns what is read from a datagram, or that it is none."""
+    try:
+        return take(payload)
+    except Exception:
+        return "no frame"
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [(1, b"", False), (0x7F, b"", True), (0x80, b"abc", False), (0x103, b"\xc4\x08" * 4, False), (0x7FF, b"", True)],
+)
+def test_a_datagram_is_read_as_python_can_does_whatever_came_before(frame: tuple[int, bytes, bool]) -> None:
+    random, (can_id, data, remote) = Random(1), frame
+    with closing(Datagrams("239.74.163.2", 43119)) as wire:
+        payload = wire.encode(can_id, data, remote)
+        assert wire.decode(payload) == Datagrams.unpack(payload) == frame
+        assert wire.decode(payload) == frame
+        for at in range(len(payload)):
+            for value in {0, 1, 0x7F, 0xC2, 0xC3, 0xFF, random.randrange(256)}:
+                changed = payload[:at] + bytes([value]) + payload[at + 1 :]
+                assert said_of(wire.decode, changed) == said_of(Datagrams.unpack, changed)
+            for changed in (payload[:at], payload[:at] + payload[at + 1 :], payload[:at] + b"\0" + payload[at:]):
+                assert said_of(wire.decode, changed) == said_of(Datagrams.unpack, changed)
+        assert wire.decode(payload) == frame
+
+
+def test_what_is_known_of_datagrams_is_bounded() -> None:
+    with closing(Datagrams("239.74.163.2", 43119)) as wire:
+        for can_id in range(0x7FF):
+            for length in range(9):
+                frame = can_id, bytes([can_id & 0xFF] * length), False
+                assert wire.decode(wire.encode(*frame)) == frame
+        assert len(wire._heard) <= 1024

@@ -89,7 +89,7 @@ def test_a_state_older_than_five_times_what_hold_bears_is_no_matter_with_predict
     plan = at_rest(plan_of("lab", "duration=10"))
     found = point_run(late(plan, 1_763 * MS, "predict"), 6000, monkeypatch)
     assert np.abs(found[-1]).max() < 1e-6 * np.abs(found[0]).max()
-    lost = point_run(late(plan, 1_763 * MS, "hold"), 6000, monkeypatch)
+    lost = point_run(late(plan, 1_763 * MS, "hold"), 2000, monkeypatch)
     assert np.abs(lost[-1]).max() > np.abs(lost[0]).max()
 
 

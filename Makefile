@@ -53,7 +53,7 @@ docs: $(VENV)/.run ## docs/scenario.md, schemas of summaries and analyses, publi
 	PYTHONPATH=tests $(BIN)/python -m support.public_names > docs/.new && mv docs/.new docs/public-names.md
 
 # Most tests wait for other processes and for clocks: files of tests run beside each other, in the order of tests/conftest.py.
-JOBS ?= 3
+JOBS ?= 2
 test: $(VENV)/.dev ## all tests
 	$(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 

@@ -1,8 +1,8 @@
 """The usual torque loop: many torque periods of a robot of the paper's plant in one call, in plain arithmetic.
 
 It gives what inverse, limits and step (`agents.torque`, `agents.plant`) give one after the other, to the last bit.  It stops
-before a torque period in which a limit may act or the robot turns fast; such a period is left to the three of them.  The source
-runs as Python, and compiled in long runs as processes (`sim.batch.torque_loop`).
+before a torque period in which a limit may act or the robot turns fast; that period and the rest of the call are left to the
+three of them.  The source runs as Python, and compiled in long runs as processes (`sim.batch.torque_loop`).
 """
 
 from collections.abc import Callable

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -27,6 +28,8 @@ REFERENCES: Final = "ECHELON_CHAOS_REFERENCES"
 """Environment variable: the folder of undisturbed runs"""
 TIMEOUT_S: Final = 400
 """How long a plan may take with all that is around it [s]"""
+ENDING_S: Final = 10
+"""How long it may take to end its run when it is broken off [s]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +109,15 @@ def carry_out_apart(plan: ChaosPlan, folder: Path, references: Path, kinds: tupl
     with subprocess.Popen(words, start_new_session=True, env=environment) as process:
         try:
             process.wait(TIMEOUT_S)
-        except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
+        except BaseException as error:
+            os.killpg(process.pid, signal.SIGINT)  # it ends the run, which has a session of its own
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(ENDING_S)
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            return Found([f"harness: it did not end within {TIMEOUT_S} s"], "none")
     if process.returncode:
         return Found([f"harness: it ended with exit code {process.returncode}"], "none")
     return Found(**json.loads((folder / FOUND).read_text()))

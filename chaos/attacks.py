@@ -144,6 +144,8 @@ def _attack_zenoh(attack: Attack) -> None:
             "connect/exit_on_failure": False,
             "listen/endpoints": [],
             "scouting/multicast/enabled": False,
+            # A run has none either; of an attack that is killed a file would be left, and be taken for one of the run.
+            "transport/shared_memory/enabled": False,
         }
         if ticket:
             settings["transport/auth/usrpwd/user"] = ticket["user"]

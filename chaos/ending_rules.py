@@ -173,7 +173,7 @@ def culprit_is_named(case: Case) -> Iterator[Violation]:
         run = evidence.summary["run"]
         told += f"\n{run.get('failure')}\n{run.get('stopped')}\n"
         told += "\n".join(c["text"] for c in evidence.summary["verdict"]["checks"] if c["outcome"] == "failed")
-    single = [done for done in evidence.done if done.hit.target not in ("", "supervisor", "group", "observers")]
+    single = [done for done in evidence.done if done.hit.target not in ("", "supervisor", "group")]
     others = [done for done in evidence.done if done.hit.target in ("supervisor", "group")]
     if others or len(single) != 1 or not (why := case.mattered(single[0])):
         return

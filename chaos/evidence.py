@@ -67,8 +67,6 @@ class Recording:
     """True: it has its end and its index"""
     states: dict[str, list[RobotState]] = field(default_factory=dict)
     """By robot"""
-    numbers: dict[str, list[int]] = field(default_factory=dict)
-    """The numbers of all messages between roles, by topic"""
     frames: list[Logged] = field(default_factory=list)
     error: str = ""
     """Why it could not be read; "" if it could, to its end or to where it was cut off"""
@@ -97,8 +95,6 @@ class Evidence:
     """The recording after `echelon recover`, if it was not whole"""
     summary: dict[str, Any] | None
     """summary.json; None if there is none or it cannot be read"""
-    report: str | None
-    """report.html; None if there is none"""
     reference: dict[str, list[RobotState]] | None
     """In virtual time the states of the same run in one process, with nothing done to it"""
     left: list[str]
@@ -155,10 +151,7 @@ def _take(found: Recording, topic: str, message: Message) -> None:
         can_id, _, _, _, length, data = _FRAME.unpack(message.data[-_FRAME.size :])
         found.frames.append(Logged(message.log_time, can_id, data[:length]))
         return
-    kind = topic.rpartition("/")[2]
-    if kind in ("state", "command", "reference", "torque", "wheels"):
-        found.numbers.setdefault(topic, []).append(message.sequence)
-    if kind == "state" and len(message.data) >= _STATE.size + 12:
+    if topic.endswith("/state") and len(message.data) >= _STATE.size + 12:
         values = _STATE.unpack(message.data[-_STATE.size :])
         state = RobotState(message.sequence, message.log_time, values)
         found.states.setdefault(topic.removesuffix("/state").lstrip("/"), []).append(state)

@@ -148,16 +148,19 @@ def carry_out(plan: ChaosPlan, folder: Path, reference: Path | None) -> Evidence
         begun_ns = time.time_ns()
         process = start(plan, folder, run_folder, temporary, port, token)
         run = _Run(plan, process, token, folder, port, [], [])
-        run.prepare()
-        for hit in plan.hits:
-            if hit.kind in STANDING:
-                run.done.append(Done(hit, begun_ns, None))
-        code = _watch(run, folder / "heard.txt", begun_ns)
+        try:
+            run.prepare()
+            for hit in plan.hits:
+                if hit.kind in STANDING:
+                    run.done.append(Done(hit, begun_ns, None))
+            code = _watch(run, folder / "heard.txt", begun_ns)
+        except BaseException:  # the user ends the trial: frozen processes would stay for ever
+            victims.kill(victims.marked(token))
+            raise
         ended_ns = time.time_ns()
         left = _left_behind(token, temporary, shared)
         time.sleep(0.1)  # for datagrams on their way
-    summary, report = read_summary(run_folder / "summary.json"), run_folder / "report.html"
-    report_text = report.read_text(errors="replace") if report.exists() else None
+    summary = read_summary(run_folder / "summary.json")
     whole = read_recording(run_folder / "run.mcap")
     recovered = None
     if whole is not None and not whole.whole:
@@ -183,7 +186,6 @@ def carry_out(plan: ChaosPlan, folder: Path, reference: Path | None) -> Evidence
         whole,
         recovered,
         summary,
-        report_text,
         unharmed.states if unharmed else None,
         left,
     )
@@ -249,11 +251,7 @@ def _left_behind(token: str, temporary: Path, shared: frozenset[str]) -> list[st
     while (left := victims.marked(token)) and time.monotonic() < deadline_s:
         time.sleep(0.05)
     found = [f"process {victims.described(pid)}" for pid in left]
-    for pid in left:
-        try:
-            os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
+    victims.kill(left)
     found += [f"temporary {path.relative_to(temporary)}" for path in sorted(temporary.rglob("*"))]
     new = victims.shared_memory() - shared
     found += [f"shared memory {name}" for name in sorted(new - victims.in_use(new))]

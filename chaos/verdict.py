@@ -152,7 +152,7 @@ class Case:
     def mattered(self, done: Done) -> str:
         """Returns in words why a run that was hit so is no good one; "" if it may be."""
         hit, run_ns = done.hit, self.run_ns
-        if hit.kind in TRAFFIC or hit.kind in ("full_disk", "no_reader") or hit.target == "observers":
+        if hit.kind in TRAFFIC or hit.kind in ("full_disk", "no_reader"):
             return ""
         over_ns = self.evidence.ended_ns if run_ns is None or not self.wall else run_ns[1]
         if done.begun_ns > over_ns - MARGIN_NS:

@@ -1,7 +1,9 @@
 """The processes of a run, as the kernel shows them: found by name, and what they leave behind."""
 
 import os
+import signal
 import socket
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -73,6 +75,13 @@ def listening(pids: list[int]) -> list[tuple[str, int]]:
             address, _, port = words[1].partition(":")
             found.append((socket.inet_ntoa(bytes.fromhex(address)[::-1]), int(port, 16)))
     return found
+
+
+def kill(pids: Iterable[int]) -> None:
+    """Kills processes, as far as they are there."""
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def shared_memory() -> frozenset[str]:

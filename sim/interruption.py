@@ -34,13 +34,12 @@ class Raises(Enum):
 
 @dataclass(slots=True)
 class Interruption:
-    """What the user has asked for; `asked` becomes True with the first signal, `hurried` with the second."""
+    """What the user has asked for; `asked` becomes True with the first signal."""
 
     raises: Raises = Raises.ALL
     at_once: Callable[[], None] = lambda: None
     """Called at each signal, for work that must not wait until the run asks"""
     asked: bool = False
-    hurried: bool = False
     _first_s: float = field(default=0.0, repr=False)
 
     def note(self, number: int, frame: FrameType | None = None) -> None:
@@ -51,7 +50,6 @@ class Interruption:
         self.at_once()
         if not first and now_s - self._first_s < SAME_S:
             return
-        self.hurried |= not first
         if self.raises is Raises.ALL or (self.raises is Raises.SECOND and not first):
             raise KeyboardInterrupt
 

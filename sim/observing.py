@@ -8,7 +8,7 @@ import json
 import os
 import threading
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Final, Self
@@ -59,6 +59,9 @@ class Ticket:
         """Reads the ticket in the folder of a run.  Raises UsageError if there is none, or it cannot be used."""
         try:
             ticket = cls(**read_json((folder / TICKET).read_bytes()))
+            texts = [one.name for one in fields(cls) if one.name != "schema_version"]
+            if wrong := [name for name in texts if not isinstance(getattr(ticket, name), str)]:
+                raise ValueError(f"{', '.join(wrong)}: must be text")
         except FileNotFoundError:
             raise UsageError(
                 f"{folder}: holds no {TICKET}; `echelon run … --observe` opens a run for observers"

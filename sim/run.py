@@ -97,7 +97,7 @@ def execute(
     metadata |= {package: version(package) for package in PACKAGES} | parts.metadata
     if engine == "inprocess":
         recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files, keep_going)
-        with interruption() if interrupted is None else nullcontext(interrupted) as noted:
+        with interruption() if interrupted is None else nullcontext(interrupted) as noted, noted.during(Raises.NONE):
             outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s, noted)
     else:
         supervisor = Supervisor(
@@ -218,17 +218,17 @@ def _in_process(
     except BaseException as other:
         error = other
     wall_s = time.monotonic() - begun_s
-    with interrupted.during(Raises.NONE):
-        try:
-            pass_on()
-        except (SystemExit, PartRunError):
-            pass
-        except BaseException as other:
-            error = error or other
-        try:
-            bridge.stop()
-        except PartRunError as why:
-            failure = failure or str(why)
+    # From here on signals raise nothing, as before the loop.
+    try:
+        pass_on()
+    except (SystemExit, PartRunError):
+        pass
+    except BaseException as other:
+        error = error or other
+    try:
+        bridge.stop()
+    except PartRunError as why:
+        failure = failure or str(why)
     if error is not None:
         bridge.close()
         raise error

@@ -110,7 +110,7 @@ def _of_candump(file: IO[bytes]) -> Iterator[Logged | LeftOut]:
                 shown_ns[entry.channel] = entry.time_ns
         if entry is not None:
             yield entry
-        unread = 0 if isinstance(entry, Logged) else unread + 1
+        unread = unread + 1 if entry is None or (isinstance(entry, LeftOut) and entry.torn) else 0
         if unread > PATIENCE:
             yield LeftOut(REST, True)
             return
@@ -244,12 +244,13 @@ def _blf_parts(file: IO[bytes]) -> Iterator[bytes]:
     if not _BLF_HEADER.size <= length <= LARGEST_OBJECT:
         raise ValueError("size of the header")
     yield header + file.read(length - len(header))
-    tail = b""
+    tail, cut = b"", False
     while head := file.read(_BLF_OBJECT.size):
         mark, _, _, size, kind = _BLF_OBJECT.unpack(head)
         if mark != b"LOBJ" or not _BLF_OBJECT.size <= size <= LARGEST_OBJECT:
             raise ValueError("an object")
         body = file.read(size - len(head))
+        cut = len(body) < size - len(head)
         file.read(size % 4)
         if kind != _CONTAINER:
             continue  # nothing else holds frames
@@ -260,6 +261,7 @@ def _blf_parts(file: IO[bytes]) -> Iterator[bytes]:
             data = unpacker.decompress(data, LARGEST_OBJECT)
             if unpacker.unconsumed_tail:
                 raise ValueError("a container that is too large")
+            cut = cut or not unpacker.eof
         tail = _checked(tail + data)
         size = _BLF_OBJECT.size + _BLF_CONTAINER.size + len(data)
         yield (
@@ -268,6 +270,8 @@ def _blf_parts(file: IO[bytes]) -> Iterator[bytes]:
             + data
             + bytes(size % 4)
         )
+        if cut:  # the frames before the cut have been read
+            raise ValueError("a container that is cut off")
 
 
 def _checked(data: bytes) -> bytes:

@@ -5,6 +5,7 @@ import errno
 import socket
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Final
 
 import can
@@ -118,7 +119,6 @@ class Datagrams:
             raise
         self.send: Callable[[bytes, int], int] = self._send_to
         self.mend(None)
-        self._parts: dict[tuple[int, int, bool], tuple[bytes, bytes]] = {}
         self._heard: dict[tuple[bytes, int], tuple[bytes, bytes, int, bool]] = {}
         """By the first bytes and the size of a datagram that has come: the bytes around its data, the identifier, and whether
         it is a remote frame.  Only datagrams as `encode` makes them are here; no more than `_KNOWN`"""
@@ -151,12 +151,10 @@ class Datagrams:
             self.send = self._send_to
         return False
 
-    def encode(self, can_id: int, data: bytes, remote: bool) -> bytes:
-        key = can_id, len(data), remote
-        parts = self._parts.get(key)
-        if parts is None:
-            parts = self._parts[key] = _around_data(*key)
-        return parts[0] + data + parts[1]
+    @staticmethod
+    def encode(can_id: int, data: bytes, remote: bool) -> bytes:
+        before, after = _around_data(can_id, len(data), remote)
+        return before + data + after
 
     def decode(self, payload: bytes) -> tuple[int, bytes, bool] | None:
         """Returns what `unpack` does.  A datagram that differs from an earlier one in its data alone is not unpacked again."""
@@ -191,6 +189,7 @@ class Datagrams:
         self.out.close()
 
 
+@lru_cache(maxsize=4 * _KNOWN)
 def _around_data(can_id: int, length: int, remote: bool) -> tuple[bytes, bytes]:
     """Returns the bytes of python-can's datagram before and after the data of a frame."""
     packed = [

@@ -12,6 +12,7 @@ from echelon.bridge.can.log_files import NO_CHANNEL, read_log
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.referee.referee import Referee
 from echelon.bridge.referee_reports import RefereeReport
+from echelon.errors import one_line
 from echelon.plan.plan import Plan
 
 NEAR_NS: Final = EPOCH_NS // 10
@@ -19,6 +20,8 @@ NEAR_NS: Final = EPOCH_NS // 10
 REASONS: Final = 20
 """How many reasons are told apart"""
 MORE: Final = "others"
+LONGEST_NAME: Final = 64
+"""How much of the name of a foreign interface is told"""
 
 Entry = tuple[int, int, Frame]
 """Run time [ns], number of the bus, frame"""
@@ -56,7 +59,7 @@ class PlanLog:
             time_ns, channel, frame = entry
             number = names.get(channel)
             if number is None:
-                self._leave_out(f"frames of the interface {channel}")
+                self._leave_out(f"frames of the interface {one_line(channel[:LONGEST_NAME])}")
                 continue
             if self.start_ns is None:
                 start_ns = self.start_ns = EPOCH_NS if abs(time_ns - EPOCH_NS) < NEAR_NS else time_ns
@@ -65,10 +68,6 @@ class PlanLog:
     def frames(self) -> Iterator[Entry]:
         """Yields frames."""
         return (entry for entry in self.entries() if entry is not None)
-
-    def what_is_left_out(self) -> str:
-        """Returns in words what is left out; "" if nothing is."""
-        return ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
 
     def _leave_out(self, reason: str) -> None:
         known = reason in self.left_out or len(self.left_out) < REASONS

@@ -14,6 +14,7 @@ from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.envelope import Envelope
 from echelon.bridge.timing.bus_load import BitCount
+from echelon.errors import PartRunError
 from echelon.plan.can_plan import EnvelopePlan
 
 
@@ -114,15 +115,19 @@ class TorqueMirror:
             self._envelopes[robot].stop(counts.last_ns)
         return self._send(robot, self._hosts[robot].mirror(0.0, 0.0, False))
 
-    def end(self) -> list[tuple[int, Frame]]:
-        """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot.  They are
-        not counted, since no state has caused them."""
-        return [
-            (robot, frame)
-            for robot, counts in enumerate(self.counts)
-            if counts.frames
-            for frame in self._hosts[robot].mirror(0.0, 0.0, False)
-        ]
+    def end(self) -> tuple[list[tuple[int, Frame]], PartRunError | None]:
+        """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot, and the
+        failure of a host, if one has failed: the other robots are stopped all the same.
+
+        The frames are not counted, since no state has caused them."""
+        frames, failure = list[tuple[int, Frame]](), None
+        for robot, counts in enumerate(self.counts):
+            if counts.frames:
+                try:
+                    frames += [(robot, frame) for frame in self._hosts[robot].mirror(0.0, 0.0, False)]
+                except PartRunError as error:
+                    failure = failure or error
+        return frames, failure
 
     def _send(self, robot: int, frames: list[Frame]) -> list[Frame]:
         counts = self.counts[robot]

@@ -15,6 +15,8 @@ from echelon.role import Stage
 
 STEPS: Final = 20
 """Steps in which the time passes that the watchdogs take: what a drive sends in a step goes out together"""
+LONGEST_REST_NS: Final = 10_000_000_000
+"""Longest time that passes so [ns].  Watchdogs may be longer, and drives send a frame in each period"""
 
 
 class LockstepDrives:
@@ -27,7 +29,7 @@ class LockstepDrives:
         self.index = self._bank.index
         self._plan, self._buses = plan, open_guarded(plan, urls)
         self._rail = Rail(self._buses)
-        self._rest_ns = 2 * max(robot.drive.watchdog_ns for robot in plan.robots)
+        self._rest_ns = min(2 * max(robot.drive.watchdog_ns for robot in plan.robots), LONGEST_REST_NS)
         self.stages: tuple[Stage, ...] = on_bus(self._bank.stages, self._rail, is_bridge=False)
 
     def interrupt(self) -> None:
@@ -37,7 +39,8 @@ class LockstepDrives:
     def stop(self) -> None:
         """Takes what the bridge has still sent, then lets the drives' watchdogs expire; sends what the drives report of it.
 
-        So who listens to the bus hears that the wheels have no torque, however the run ends."""
+        So who listens to the bus hears that the wheels have no torque, however the run ends.  Of watchdogs beyond half of
+        `LONGEST_REST_NS` that is so only where the bridge has stopped the drives, as it does unless it was killed."""
         time_ns = self._bank.next_ns
         frames = []
         for number, bus in enumerate(self._buses):

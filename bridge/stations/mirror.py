@@ -108,9 +108,10 @@ class MirrorBridge(Bridge):
     def stop(self) -> None:
         """Takes the torque away from the wheels and disables their drives: drives on the bus obey mirrored frames, too.
 
-        After that nothing is sent any more."""
+        After that nothing is sent any more.  Raises PartRunError if a host failed, after all others are stopped."""
         self._stopped = True
         now_ns = None if self.clock is None else self.clock.now()
+        stops, failure = self._mirror.end()
         frames = [
             # in virtual time each is due when the robot's next one would be
             TimedFrame(
@@ -119,12 +120,14 @@ class MirrorBridge(Bridge):
                 BRIDGE_NODE,
                 frame,
             )
-            for robot, frame in self._mirror.end()
+            for robot, frame in stops
         ]
         frames.sort(key=lambda timed: timed.time_ns)
         wall_ns = time.monotonic_ns()
         for time_ns, bus, _, (can_id, data, remote) in send_all(self._buses, frames):
             self._log.write(time_ns, can_id, data, wall_ns, self._names[bus], remote)
+        if failure is not None:
+            raise failure
 
     def flush(self) -> None:
         """Hands all lines of can.log to the operating system."""

@@ -17,6 +17,7 @@ from typing import Final
 from echelon.bridge.can.bus import Bus
 from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame, frames_of
 from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.stations.guarding import check_sender
 from echelon.messages import Channel, Heard, Message
 from echelon.role import Stage
 
@@ -72,8 +73,7 @@ class Rail:
             if Frame(received.can_id, received.data, received.remote) == wanted:
                 return
             self.foreign += 1
-            if received.can_id in bus.guard.own:
-                bus.guard.count(received.sender, received.can_id)
+            check_sender(bus, bus.guard.own, received)
 
 
 def on_bus(

@@ -74,7 +74,7 @@ def blackout(
         now_ns = step * run.hyperperiod_ns
         x = mean(run.steps, x, dark if at_ns <= now_ns < at_ns + duration_ns else bright)
     return tuple(
-        _effect(
+        effect(
             block.name,
             np.linalg.norm(found[:, block.offset : block.offset + block.size], axis=1),
             run.hyperperiod_ns,
@@ -86,8 +86,9 @@ def blackout(
     )
 
 
-def _effect(name: str, errors: Array, H_ns: int, begin_ns: int, end_ns: int) -> BlackoutEffect:
-    begin, end = -(-begin_ns // H_ns), -(-end_ns // H_ns)
+def effect(name: str, errors: Array, H_ns: int, begin_ns: int, end_ns: int) -> BlackoutEffect:
+    """Returns the peak and the recovery of a block from its errors at multiples of the hyperperiod `H_ns`."""
+    begin, end = (min(-(-each_ns // H_ns), len(errors) - 1) for each_ns in (begin_ns, end_ns))
     peak = begin + int(np.argmax(errors[begin:]))
     above = np.flatnonzero(errors[end:] > errors[begin])
     recovery: float | None = 0.0 if not len(above) else (above[-1] + 1) * H_ns * 1e-9

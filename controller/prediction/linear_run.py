@@ -30,7 +30,7 @@ from echelon.controller.prediction.linear_roles import LinearNode, LinearRobot, 
 from echelon.controller.prediction.schedule import schedule
 from echelon.controller.prediction.unit_vectors import Columns, Rows
 from echelon.messages import Channel
-from echelon.plan.delay_tables import LOST
+from echelon.plan.delay_tables import LOST, DelayTable, DelayTrace
 from echelon.plan.layout import with_message_sizes
 from echelon.plan.link_plan import LinkPlan
 from echelon.plan.plan import Array, Plan
@@ -85,14 +85,17 @@ def edge_of(link: LinkPlan) -> Edge:
 def later(plan: Plan, late: Channel | Edges, extra_ns: int) -> Plan:
     """Returns the plan with `extra_ns` added to the delays of some links, or of all links of a channel of `CHANNELS`."""
     edges = edges_of(plan, late)
+    moved: dict[int, DelayTable | DelayTrace] = {}  # equal tables stay one object
 
     def longer(link: LinkPlan) -> LinkPlan:
         if edge_of(link) not in edges:
             return link
         delays = link.delays
         if delays is not None:
-            moved = tuple(each if each == LOST else each + extra_ns for each in delays.delays_ns)
-            delays = replace(delays, delays_ns=moved)
+            if id(delays) not in moved:
+                each_ns = tuple(each if each == LOST else each + extra_ns for each in delays.delays_ns)
+                moved[id(delays)] = replace(delays, delays_ns=each_ns)
+            delays = moved[id(delays)]
         return replace(
             link,
             delay_min_ns=link.delay_min_ns + extra_ns,

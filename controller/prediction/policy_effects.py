@@ -42,8 +42,8 @@ MANY: Final = 100
 """Number of registers from which that is tried first: it is faster than all eigenvalues"""
 CLEAR: Final = 1e-3
 """How far from 1 a growth must be that is found so"""
-MOST: Final = 250
-"""Most numbers that may act on each other where losses are computed"""
+LARGEST_LOSSES: Final = 250
+"""Most numbers that may act on each other where losses are computed: a few seconds for each set of links"""
 LONGEST: Final = 400
 """Longest delay that is tried [periods]"""
 GROWTH: Final = 1.6
@@ -120,9 +120,8 @@ def policy_effect(plan: Plan, channel: Channel, policy: str, longest: int = LONG
 
     Raises PredictionError if the law is not linear, or if periods differ."""
     T_ns = plan.root.period_ns
-    alike = reduced(without_chance(plan), edges_of(plan, channel))[
-        0
-    ]  # has the same eigenvalues with any constant delays
+    # Like robots are left out: with constant delays the eigenvalues are the same.
+    alike, *_ = reduced(without_loss(plan), edges_of(plan, channel))
 
     def is_stable(periods: int) -> bool:
         return radius_without_loss(with_policy(alike, channel, policy, periods * T_ns), MANY) < 1
@@ -133,14 +132,14 @@ def policy_effect(plan: Plan, channel: Channel, policy: str, longest: int = LONG
     loss, why = None, ""
     try:
         changed = with_policy(plan, channel, policy)
-        loss = mean_square(changed, ruled_links(changed, channel), largest=MOST)
+        loss = mean_square(changed, ruled_links(changed, channel), largest=LARGEST_LOSSES)
     except PredictionError as error:
         why = str(error)
     ends: Literal["unstable", "limit"] = "unstable" if unstable else "limit"
     return PolicyEffect(channel, policy, None if periods is None else periods * T_ns * 1e-9, ends, loss, why)
 
 
-def without_chance(plan: Plan) -> Plan:
+def without_loss(plan: Plan) -> Plan:
     """Returns a plan whose links lose nothing."""
     return replace(plan, links=tuple(replace(link, loss=0.0, bursts=None) for link in plan.links))
 

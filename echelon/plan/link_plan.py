@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from echelon.messages import Channel
 from echelon.plan.can_plan import NEVER_NS
-from echelon.plan.delay_tables import TRUE_CLOCK, Bursts, ClockPlan, DelayTable, DelayTrace, Windows
+from echelon.plan.delay_tables import LOST, TRUE_CLOCK, Bursts, ClockPlan, DelayTable, DelayTrace, Windows
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +89,14 @@ class LinkPlan:
     def steady(self) -> bool:
         """True if the link loses nothing, blackouts aside, and all of its messages take the same time."""
         return self.loss == 0.0 and self.delay_min_ns == self.delay_max_ns and not self.delays
+
+    @property
+    def share_lost(self) -> float:
+        """The share of messages that the link loses, blackouts aside; of a trace it is the share of its entries."""
+        in_trace = 0.0
+        if isinstance(self.delays, DelayTrace):
+            in_trace = self.delays.delays_ns.count(LOST) / len(self.delays.delays_ns)
+        return 1 - (1 - self.loss) * (1 - in_trace) if in_trace else self.loss
 
     @property
     def prompt(self) -> bool:

@@ -105,12 +105,14 @@ def effective_toml(scenario: Scenario, names: Mapping[Source, str] | None = None
 
 _PARTS: Final = 1000
 """The largest number of parts that a key may have.  For a longer one tomllib takes time by the square of its length."""
+_TEXT: Final = re.compile(r'''"""(?:[^\\]|\\.)*?"""|'{3}.*?'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|\#[^\n]*''', re.DOTALL)
+"""Strings, quoted parts of keys, and comments: dots and separators in them mean nothing"""
 _BETWEEN_KEYS: Final = re.compile(r"[=,\n\[\]{}]")
 
 
 def read_table(text: str, name: str) -> dict[str, Any]:
     """Returns TOML text as a table.  Raises ScenarioError."""
-    if any(one.count(".") >= _PARTS for one in _BETWEEN_KEYS.split(text)):
+    if any(one.count(".") >= _PARTS for one in _BETWEEN_KEYS.split(_TEXT.sub("q", text))):
         raise ScenarioError(f"{name}: not TOML that can be read: a key of {_PARTS} parts or more")
     try:
         return tomllib.loads(text)

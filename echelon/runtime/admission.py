@@ -100,7 +100,6 @@ class Admission:
         "_first_ns",
         "_fits",
         "_late_ns",
-        "_most",
         "_name",
         "_period_ns",
         "_refusals",
@@ -134,7 +133,7 @@ class Admission:
         self._refusals, self._name = refusals, name
         self.source, self.channel = source, channel
         self._begin = _BEGIN.pack(SCHEMA_VERSION, channel, 0, source)
-        self._size, self._most = size, size if size is not None else 1 << 32
+        self._size = size
         self._first_ns, self._period_ns, self._late_ns = first_ns, period_ns, late_ns
         self._end_ns, self._ahead_ns = end_ns, ahead_ns
         self._fits = fits
@@ -161,7 +160,7 @@ class Admission:
         number, time_ns, count = _unpack_rest(payload, BEGIN)
         if length != _HEADER_SIZE + 8 * count:
             return self._refuse(why(payload))
-        if count != self._size and count and (self._size is not None or count > self._most):
+        if count and count != self._size and self._size is not None:
             return self._refuse(MISSHAPEN)
         if number <= self.newest:
             return self._refuse(AGAIN)

@@ -204,16 +204,15 @@ CheckName = Literal[
 class Health(Table):
     """Checks of every run, whatever it claims.  A check that fails fails the verdict.
 
-    `whole`: the run reaches its end.  `finite`: all states are finite numbers.  `growth`: no error grows in the last third of
-    the run.  `end`: no block ends with a larger error than it started with.  `distance`, if avoidance is off: robots keep
-    `avoidance.avoidance_radius` nevertheless.  `avoidance`, if it is on: robots keep that radius, and avoidance acted at least
-    once.  `saturation`: no robot's limits act for too long.  `messages`: on every link messages arrive and are used.
-    `silence`: no robot is silent for too long.  `standstill`, on a wall clock: no process stands still for longer than
-    `can.watchdog`, or `silence` if the run has no bus.  `refused`: no message is refused.  `late`, on a wall clock:
-    stages run in time.
-    `drives`, if the torque path is closed: all drives come up, and at the end no drive has a fault without an event that
-    explains it.  `referee`: nothing on the bus breaks the contract.  `senders`: nobody else sends frames with identifiers of
-    the run.  `recording`: the recording is complete"""
+    `whole`: the run reaches its end.  `finite`: all states are finite, and within the bounds of all messages.  `growth`: no
+    error grows in the last third of the run.  `end`: no block ends with a larger error than it started with.  `distance`, if
+    avoidance is off: robots keep `avoidance.avoidance_radius` nevertheless.  `avoidance`, if it is on: robots keep that
+    radius, and avoidance acted at least once.  `saturation`: no robot's limits act for too long.  `messages`: on every link
+    messages arrive and are used.  `silence`: no robot is silent for too long.  `standstill`, on a wall clock: no process
+    stands still for longer than `can.watchdog`, or `silence` if the run has no bus.  `refused`: no message is refused.
+    `late`, on a wall clock: stages run in time.  `drives`, if the torque path is closed: all drives come up, and at the end
+    no drive has a fault without an event that explains it.  `referee`: nothing on the bus breaks the contract.  `senders`:
+    nobody else sends frames with identifiers of the run.  `recording`: the recording is complete"""
 
     off: list[CheckName] = []
     """Checks that are left out"""

@@ -24,8 +24,10 @@ class LinkMaker:
         self.plan, self.pools = plan, pools
         self.numbers = {(link.source, link.receiver, link.channel): at for at, link in enumerate(plan.links)}
         """The numbers of the links"""
-        sources = dict.fromkeys((link.source, link.channel) for link in plan.links)
-        self.streams = {source: at for at, source in enumerate(sources)}
+        self._of: dict[tuple[int, Channel], list[LinkPlan]] = {}
+        for link in plan.links:
+            self._of.setdefault((link.source, link.channel), []).append(link)
+        self.streams = {source: at for at, source in enumerate(self._of)}
         """The numbers of the streams: every source and channel that a link begins with, in the order of the links"""
 
     def make(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -39,8 +41,8 @@ class LinkMaker:
     def _depth(self, source: int, channel: Channel) -> int:
         """Returns how many messages of a stream are kept: a power of two, above those in flight at any time."""
         most = 1
-        for link in self.plan.links:
-            if (link.source, link.channel) == (source, channel) and not link.prompt:
+        for link in self._of[source, channel]:
+            if not link.prompt:
                 # A message may be sent a period late, and is asked for a period of the receiver later.
                 asked_ns = self.plan.formation[link.receiver].period_ns
                 late_ns = min(link.delay_max_ns, self.plan.duration_ns) + asked_ns
@@ -49,12 +51,7 @@ class LinkMaker:
 
     def _stream(self, source: int, channel: Channel) -> dict[str, Any]:
         depth = self._depth(source, channel)
-        if channel is Channel.STATE:
-            length = self.state_length(source)
-        else:
-            length = next(
-                link.size or 0 for link in self.plan.links if (link.source, link.channel) == (source, channel)
-            )
+        length = self.state_length(source) if channel is Channel.STATE else self._of[source, channel][0].size or 0
         return {
             "length": length,
             "mask": depth - 1,

@@ -3,6 +3,7 @@
 from math import ceil, isfinite, sqrt
 from typing import Any, Final
 
+from echelon.agents.plant import FAST_TURN, INNER
 from echelon.sim.batch.angles import cos_sin, turned
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.records import (
@@ -22,11 +23,9 @@ from echelon.sim.batch.records import (
     V,
 )
 
-_INNER: Final = (1 - sqrt(1 / 5)) / 2
-"""Inner points of the Gauss-Lobatto rule with four points on [0, 1]: this, and 1 less this"""
 _ENDS: Final = 1 / 12
 _MIDDLE: Final = 5 / 12
-"""Its weights"""
+"""The weights of the Gauss-Lobatto rule with four points on [0, 1]; `INNER` and 1 less that are its inner points"""
 State = tuple[float, float, float, float, float, float, float]
 """x, y, θ, v, ω, cos θ and sin θ"""
 
@@ -213,8 +212,8 @@ def paper_step(
     c_1, s_1 = cos_sin(theta_1)
     x, y = x + d * (c_1 - c_0), y + d * (s_1 - s_0)
     turn = h * (abs(omega) + abs(omega_dot) * h)
-    if turn <= 0.5:
-        t_1, t_2 = _INNER * h, (1 - _INNER) * h
+    if turn <= FAST_TURN:
+        t_1, t_2 = INNER * h, (1 - INNER) * h
         c_i, s_i = turned(c_0, s_0, theta, t_1 * (omega + half * t_1))
         c_j, s_j = turned(c_0, s_0, theta, t_2 * (omega + half * t_2))
         v_i, v_j = v + v_dot * t_1, v + v_dot * t_2
@@ -230,7 +229,7 @@ def paper_step(
         for panel in range(panels):
             for node in range(4):
                 weight = ends if node in (0, 3) else inner
-                part = 0.0 if node == 0 else (_INNER if node == 1 else (1 - _INNER if node == 2 else 1.0))
+                part = 0.0 if node == 0 else (INNER if node == 1 else (1 - INNER if node == 2 else 1.0))
                 t = (panel + part) * width
                 along = weight * (v + v_dot * t)
                 c, s = cos_sin(theta + t * (omega + half * t))

@@ -100,7 +100,7 @@ def analysis_of(
         acceleration_periods=_each_once(node.period_ns for node in plan.nodes),
         torque_periods=_each_once(robot.torque_period_ns for robot in plan.robots),
         delays=_of_channels(plan, lambda link: (link.delay_min_ns / 1e9, link.delay_max_ns / 1e9)),
-        losses=_of_channels(plan, lambda link: (link.loss,) if link.loss else ()),
+        losses=_of_channels(plan, lambda link: (link.share_lost,) if link.share_lost else ()),
         policies=_of_channels(plan, lambda link: () if link.policy == "hold" else (link.policy,)),
         random=is_random(plan),
         verdict=verdict,

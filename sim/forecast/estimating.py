@@ -70,7 +70,7 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class Boundary:
-    """The largest value up to which E|e|² shrinks, by runs (`sim.results.analysis.EstimateResult`)."""
+    """The largest value up to which E|e|² shrinks, by runs (`sim.results.links_analysis.EstimateResult`)."""
 
     value: float | None
     low: float | None
@@ -85,8 +85,8 @@ class Estimates:
         """`runs` is the largest number of runs for each estimate; fewer are made of large scenarios.  0: none at all."""
         self._say = say
         periods = plan.duration_ns // min(robot.torque_period_ns for robot in plan.robots) + 1
-        self._most = min(runs, max(LEAST, MOST_STEPS // (periods * len(plan.robots))))
-        self.runs = self._most if is_random(plan) else 1
+        most = min(runs, max(LEAST, MOST_STEPS // (periods * len(plan.robots))))
+        self.runs = most if is_random(plan) else 1
         self._share = SEARCH_STEPS / RUNS / (VALUES * periods * len(plan.robots))
         self.in_search = min(runs, IN_SEARCH, int(self._share * runs))
         """Runs for each value of a search; with fewer than `LEAST` there is none"""

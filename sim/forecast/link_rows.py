@@ -10,6 +10,7 @@ from echelon.controller.prediction.largest_delay import LargestDelay, largest_ex
 from echelon.controller.prediction.linear_run import Edges, edge_of, later
 from echelon.controller.prediction.link_sets import LinkSet, link_sets
 from echelon.controller.prediction.mean_square import mean_square
+from echelon.controller.prediction.policy_effects import LARGEST_LOSSES
 from echelon.plan.plan import Plan
 from echelon.plan.punctuality import with_punctuality
 from echelon.sim.forecast.estimating import Boundary, Estimates
@@ -25,8 +26,6 @@ DELAYS: Final = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 2.0, 6.0)
 """Delays that are tried by runs, as multiples of what is exact without chance"""
 LOSSES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 """Losses that are tried by runs"""
-LARGEST: Final = 250
-"""Most numbers that may act on each other where losses are computed: a few seconds for each set of links"""
 OF_MEMBERS: Final = ("group", "robot")
 Say = Callable[[str, int, int], None]
 """What is being computed, how many parts are done, and how many there are"""
@@ -62,7 +61,7 @@ class LinkRows:
         try:
             check_size(self._plan)
             links = [link for link in self._plan.links if edge_of(link) in edges]
-            found = mean_square(self._plan, links, largest=LARGEST)
+            found = mean_square(self._plan, links, largest=LARGEST_LOSSES)
         except PredictionError as error:
             no_search = self._estimates.why_no_search
             return LossResult(None, "not computed", f"{error}{no_search and f'; {no_search}'}")

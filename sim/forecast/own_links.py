@@ -4,21 +4,21 @@ Each answer is exact where `controller.prediction` can give one, otherwise estim
 which, and why.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from math import inf, isfinite, log
+from math import isfinite, log
 from typing import Final
 
 import numpy as np
 
 from echelon.controller.late_states import EXTRAPOLATE, PREDICT
 from echelon.controller.prediction.analysis import Analysis, analyse
-from echelon.controller.prediction.blackout import blackout
+from echelon.controller.prediction.blackout import BlackoutEffect, blackout, effect
 from echelon.controller.prediction.cost import expected_cost
 from echelon.controller.prediction.gains import PredictionError
 from echelon.controller.prediction.linear_run import CHANNELS, ruled_links, untreated
 from echelon.controller.prediction.mean_square import Losses
-from echelon.controller.prediction.policy_effects import POLICIES, policy_effect, uses_policy
+from echelon.controller.prediction.policy_effects import LONGEST, POLICIES, policy_effect, uses_policy
 from echelon.controller.prediction.random_delays import mean_delay_ns
 from echelon.controller.prediction.typical_growth import typical_growth
 from echelon.messages import Channel
@@ -48,8 +48,6 @@ TIMES: Final = 15.0
 """Time constants over which it is"""
 LONGER: Final = 6
 """Delays are tried with policies up to this multiple of what `hold` bears"""
-LONGEST: Final = 400
-"""Longest delay that is tried with policies [periods]"""
 
 
 class OwnLinks:
@@ -99,13 +97,14 @@ class OwnLinks:
             return CostResult("exact", cost.total, 0.0, blocks, 0, "")
         except PredictionError as error:
             why = str(error)
-        if self.estimates.why_not or (len(plan.robots) > MOST and not self._runs):
+        if self.estimates.why_not or len(plan.robots) > MOST:
             return CostResult("not computed", None, 0.0, (), 0, why)
         means, errors, total, error_of_total = mean_integrals(self.runs())
         if not isfinite(total):
             return CostResult("not computed", None, 0.0, (), 0, f"{why}; and a run was lost")
-        rows = zip(plan.blocks, means.tolist(), errors.tolist(), strict=True)
-        found = tuple(BlockCostResult(one.name, mean, error, mean / total) for one, mean, error in rows if one.size)
+        shares = means / total if total else means
+        rows = zip(plan.blocks, means.tolist(), errors.tolist(), shares.tolist(), strict=True)
+        found = tuple(BlockCostResult(block.name, *values) for block, *values in rows if block.size)
         return CostResult("estimated", total, error_of_total, found, self.estimates.runs, why)
 
     def effects(self, bears: Callable[[Channel], float | None], say: Callable[[str], None]) -> tuple[PolicyResult, ...]:
@@ -122,7 +121,7 @@ class OwnLinks:
                     check_size(self.plan)
                     most = bears(channel)
                     T_s = self.plan.root.period_ns / 1e9
-                    longest = LONGEST if most is None or most == inf else max(4, round(LONGER * most / T_s))
+                    longest = LONGEST if most is None else max(4, round(LONGER * most / T_s))
                     effect = policy_effect(self.plan, channel, policy, min(longest, LONGEST))
                 except PredictionError as error:
                     none = LossResult(None, "not computed", str(error))
@@ -159,20 +158,21 @@ class OwnLinks:
             if untreated(plan):
                 raise PredictionError("the links lose other messages, have delays that vary, or policies")
             effects = blackout(plan, links, begin_ns, end_ns - begin_ns)
-            blocks = tuple(BlackoutBlockResult(one.name, one.peak, one.peak_time, one.recovery) for one in effects)
-            return BlackoutResult(*facts, "exact", blocks, "")
+            return BlackoutResult(*facts, "exact", _results(effects), "")
         except (PredictionError, ValueError) as error:
             why = str(error)
         if self.estimates.why_not:
             return BlackoutResult(*facts, "not computed", (), f"{why}; nor is it estimated: {self.estimates.why_not}")
         runs = self.runs()
         assert runs.mean_squares is not None
-        H_s = plan.duration_ns / 1e9 / max(1, len(runs.mean_squares) - 1)
-        found = []
-        for at, block in enumerate(plan.blocks):
-            if block.size:
-                found.append(_after(block.name, np.sqrt(runs.mean_squares[:, at]), H_s, begin_ns / 1e9, end_ns / 1e9))
-        return BlackoutResult(*facts, "estimated", tuple(found), why)
+        H_ns = plan.duration_ns // max(1, len(runs.mean_squares) - 1)
+        errors = np.sqrt(runs.mean_squares)
+        found = [
+            effect(block.name, errors[:, at], H_ns, begin_ns, end_ns)
+            for at, block in enumerate(plan.blocks)
+            if block.size
+        ]
+        return BlackoutResult(*facts, "estimated", _results(found), why)
 
     def _typical(self, radius: float) -> tuple[float | None, float | None]:
         """Returns the rate at which a typical run shrinks [1/s], and its standard error; None if it is not computed."""
@@ -189,6 +189,10 @@ class OwnLinks:
         return -found.rate / H_s, found.error / H_s
 
 
+def _results(effects: Iterable[BlackoutEffect]) -> tuple[BlackoutBlockResult, ...]:
+    return tuple(BlackoutBlockResult(one.name, one.peak, one.peak_time, one.recovery) for one in effects)
+
+
 def check_size(plan: Plan) -> None:
     """Raises PredictionError if a plan has too many robots for what takes long."""
     if len(plan.robots) > MOST:
@@ -202,7 +206,7 @@ def calm(plan: Plan) -> tuple[Plan, str]:
     if not found:
         return plan, ""
     out = [
-        "losses" if any(link.loss for link in found) else "",
+        "losses" if any(link.share_lost for link in found) else "",
         "policies extrapolate and predict" if any(link.policy in (EXTRAPOLATE, PREDICT) for link in found) else "",
     ]
     varying = any(link.delays or link.delay_min_ns != link.delay_max_ns for link in found)
@@ -224,14 +228,3 @@ def calm(plan: Plan) -> tuple[Plan, str]:
 
 def _rate(radius: float, hyperperiod_s: float) -> float | None:
     return None if radius <= 0 else -log(radius) / hyperperiod_s
-
-
-def _after(name: str, errors: np.ndarray, H_s: float, begin_s: float, end_s: float) -> BlackoutBlockResult:
-    """Returns the peak and the recovery from root mean squares over time."""
-    begin, end = min(int(np.ceil(begin_s / H_s)), len(errors) - 1), min(int(np.ceil(end_s / H_s)), len(errors) - 1)
-    peak = begin + int(np.argmax(errors[begin:]))
-    above = np.flatnonzero(errors[end:] > errors[begin])
-    recovery: float | None = 0.0 if not len(above) else (int(above[-1]) + 1) * H_s
-    if len(above) and end + above[-1] == len(errors) - 1:
-        recovery = None
-    return BlackoutBlockResult(name, float(errors[peak]), peak * H_s, recovery)

@@ -94,8 +94,10 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
         for messages in reception.drain(order.robot_messages):
             take(messages)
     finally:
-        stop()
-        bridge.close()
+        try:
+            stop()
+        finally:
+            bridge.close()
     watch.pulse.rest()
     finish(spec, control, report=bridge.report(), refusals=reception.refusals)
 

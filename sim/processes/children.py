@@ -137,7 +137,10 @@ class Child:
         code = self.process.exitcode
         if code is None:
             return "ended"
-        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        if code >= 0:
+            return f"exit code {code}"
+        named = -code in {*signal.Signals}  # real-time signals have no names
+        return f"killed by {signal.Signals(-code).name if named else f'signal {-code}'}"
 
     @property
     def was_killed(self) -> bool:

@@ -66,13 +66,13 @@ def finish_watchers(
     say: Callable[[str], None],
     failure: str | None,
     whole: bool,
-    hurried: Callable[[], bool] = lambda: False,
+    asked: Callable[[], bool] = lambda: False,
 ) -> str | None:
     """Lets bridge, drives, referee and recorder finish, in this order; returns the failure of the run, old or new.
 
     If a run is `whole`, every message that was sent arrives, and watchers wait for all of them.  In other runs messages may be
-    lost, and watchers wait until it is silent.  `say` shows a note to the user.  Once the user is `hurried`, each watcher has
-    `GRACE_S`."""
+    lost, and watchers wait until it is silent.  `say` shows a note to the user.  Once the user has `asked` for the end, each
+    watcher has `GRACE_S`."""
     links = tuple(counts for child in children if child.done for counts in child.done.links)
     sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
     for child in children:
@@ -88,7 +88,7 @@ def finish_watchers(
                 robot_messages=sent["robot"] if told else None,
                 messages=sum(sent.values()) if told else None,
             )
-            failure = _finish(child, order, serve, say, failure, hurried)
+            failure = _finish(child, order, serve, say, failure, asked)
             if child.done is not None and isinstance(child.done.report, CanReport):
                 sent["bridge"] = child.done.report.messages
     for child in children:
@@ -109,7 +109,7 @@ def _finish(
     serve: Serve,
     say: Callable[[str], None],
     failure: str | None,
-    hurried: Callable[[], bool],
+    asked: Callable[[], bool],
 ) -> str | None:
     """Sends the order to finish to a process and waits until it is done; returns the failure of the run, old or new.
 
@@ -125,7 +125,7 @@ def _finish(
                 failure = failure or _lost(child)
                 child.signal(signal.SIGCONT)
                 begun_s, continued = time.monotonic(), True
-            elif waited_s > (GRACE_S if failure or hurried() or stopped else FINISH_TIMEOUT_S):
+            elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
                 break
             if not failure and waited_s > STALL_REPORT_S:
                 say(f"waits for {child.name} to finish ({child.state()})")

@@ -1,5 +1,6 @@
 """What the supervisor hears: messages over the pipes of its children, their standard error, and their ends."""
 
+import os
 import time
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final
@@ -46,8 +47,12 @@ class Hearing:
                 by_handle[child.control] = child
             if not child.words.closed:
                 by_handle[child.words] = child
-        ends = [child.handle for child in self._children if child.done is None and child.handle >= 0]
-        for handle in wait([*by_handle, *ends, self.wake], timeout_s):
+        # Handles of processes that have ended stay readable: with them a wait would be none.
+        ends = [child.handle for child in self._children if child.done is None and child.alive]
+        ready = wait([*by_handle, *ends, self.wake], timeout_s)
+        if self.wake in ready:
+            os.eventfd_read(self.wake)
+        for handle in ready:
             if isinstance(handle, Connection):
                 child = by_handle[handle]
                 if handle is child.words:

@@ -26,9 +26,8 @@ class Pulse:
         """Run time 0: what ends before it does not count, since no wheel has torque yet"""
 
     @classmethod
-    def received(cls, shared: Any, number: int) -> "Pulse":
-        """Returns the pulse of this process, from what `Pulses.shared` gave it."""
-        fd = shared.detach()
+    def received(cls, fd: int, number: int) -> "Pulse":
+        """Returns the pulse of this process, from what became of `Pulses.shared` here."""
         try:
             return cls(memoryview(mmap.mmap(fd, 0)).cast("q"), number)
         finally:
@@ -68,11 +67,6 @@ class Pulse:
         """Whether the process has taken the torque away from all wheels."""
         return bool(self._cells[self._at + _STOPPED])
 
-    @property
-    def due_ns(self) -> int:
-        """When the process will be at work again at the latest; 0 before its first pulse."""
-        return self._cells[self._at]
-
     def overdue_ns(self, now_ns: int) -> int:
         """Returns for how long the process has stood still."""
         due_ns = self._cells[self._at]
@@ -92,6 +86,23 @@ class Standstill:
     from_ns: int = 0
 
 
+class Shared:
+    """The memory with the pulses, for a process that is just starting: pickled while that starts, it goes through the fork
+    server.  (At other times multiprocessing would open a server and a thread for it.)"""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _detached, (DupFd(self._fd),)
+
+
+def _detached(passed: Any) -> int:
+    """Returns the file descriptor that has been passed to this process."""
+    fd: int = passed.detach()
+    return fd
+
+
 class Pulses:
     """The memory with the pulses of `count` processes, from the supervisor's side."""
 
@@ -104,9 +115,9 @@ class Pulses:
         """Returns the pulse of a process."""
         return Pulse(self._cells, number)
 
-    def shared(self) -> Any:
-        """Returns what a process that is just starting gets, for `Pulse.received`."""
-        return DupFd(self._fd)
+    def shared(self) -> "Shared":
+        """Returns what a process that is just starting gets.  There it is a file descriptor, for `Pulse.received`."""
+        return Shared(self._fd)
 
     def close(self) -> None:
         """Closes the file; the memory lives as long as somebody uses it."""

@@ -50,8 +50,8 @@ class StandstillWatch:
         `now_ns` is on the monotonic clock.  Raises RunError if the bridge or the drives do for `BREAK_S`, or
         `RECOVER_S`."""
         asleep, self._looked_ns = now_ns - self._looked_ns > ASLEEP_S * 1e9, now_ns
-        if asleep:  # give all processes the time to go on
-            return
+        if asleep or now_ns < self._progress.started_s * 1e9:
+            return  # all processes get the time to go on; before run time 0 no wheel has torque yet
         overdue_s = {child.name: child.pulse.overdue_ns(now_ns) / 1e9 for child in self._children if child.done is None}
         still = [child for child in self._children if overdue_s.get(child.name, 0.0) > STANDSTILL_S]
         if new := [self._text(child, overdue_s[child.name]) for child in still if child.name not in self._named]:

@@ -194,9 +194,9 @@ class Supervisor:
 
     def _standstills(self) -> dict[str, tuple[int, int]]:
         """Returns for each process the longest time for which it stood still, and from when on in run time [ns]."""
-        if self.virtual or not self.progress.started_s:
-            return {}
         now_ns, start_ns = time.monotonic_ns(), round(self.progress.started_s * 1e9)
+        if self.virtual or not 0 < start_ns < now_ns:
+            return {}
         found = {child.name: child.pulse.standstill(now_ns) for child in self._children}
         return {name: (one.lasted_ns, one.from_ns - start_ns) for name, one in found.items() if one.lasted_ns}
 

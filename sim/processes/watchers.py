@@ -66,7 +66,7 @@ class Reception:
         self._hold_s = hold_s
         self._order = TimeOrder(sources, hold_s)
         admissions = admissions_of(plan, sources, self.refusals, virtual=spec.virtual, frames=FrameBounds(plan))
-        self._names = {source: next(each.name for each in admissions if each.source == source) for source in sources}
+        self._names = {each.source: each.name for each in admissions}
         self._admissions: dict[int, dict[bytes, Admission]] = {source: {} for source in sources}
         for each in admissions:
             self._admissions[each.source][each.begin] = each

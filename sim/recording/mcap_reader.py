@@ -30,7 +30,7 @@ from echelon.sim.recording import ros
 from echelon.sim.recording.mcap_writer import CHUNK_SIZE, MAGIC, METADATA
 from echelon.sim.recording.recorder import LINKS, SCENARIO, state_topic, torque_topic
 from echelon.sim.recording.ros_definitions import schema_name, schema_text
-from echelon.sim.recording.unpacking import room_of, unpack
+from echelon.sim.recording.unpacking import LARGEST_CHUNK, room_of, unpack
 from echelon.sim.results.trace import Trace
 
 _RECORD: Final = struct.Struct("<BQ")
@@ -235,9 +235,9 @@ def records(path: Path, damaged: list[str] | None = None) -> Iterator[McapRecord
                 else:
                     record = _record(opcode, file.read(length))
                     if isinstance(record, Chunk):
-                        data = _unpacked(record, room)
-                        room -= len(data)
-                        yield from _records_in(data)
+                        left, stated = room, record.uncompressed_size
+                        room -= stated if stated <= min(room, LARGEST_CHUNK) else 0  # also if it turns out damaged
+                        yield from _records_in(_unpacked(record, left))
                     else:
                         yield record
             except ValueError as error:

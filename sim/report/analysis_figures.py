@@ -79,11 +79,10 @@ def _policies(effects: Sequence[PolicyResult], command: str) -> Picture:
     def draw(figure: Figure) -> None:
         delays, losses = figure.subplots(1, 2, sharey=True)
         for at, one in enumerate(effects):
-            look = Look.of_run(list(POLICIES).index(one.policy))
+            look, ms = Look.of_run(POLICIES.index(one.policy)), 1e3 * (one.delay or 0.0)
             more = ">" if one.delay_ends == "limit" else look.mark
-            delays.plot([1e3 * (one.delay or 0.0)], [at], more, ms=8, color=look.colour)
-            delays.annotate(_digits(1e3 * (one.delay or 0.0)), (1e3 * (one.delay or 0.0), at), (7, 0),
-                            textcoords="offset points", va="center", fontsize=8)  # fmt: skip
+            delays.plot([ms], [at], more, ms=8, color=look.colour)
+            delays.annotate(f"{ms:.4g} ms", (ms, at), (7, 0), textcoords="offset points", va="center", fontsize=8)
             if one.loss.share is not None:
                 losses.plot([100 * one.loss.share], [at], ">" if one.loss.ends == "limit" else look.mark, ms=8,
                             color=look.colour)  # fmt: skip
@@ -101,10 +100,6 @@ def _policies(effects: Sequence[PolicyResult], command: str) -> Picture:
         _caption(figure, command)
 
     return Picture(WIDTH, 0.34 * len(effects) + 1.6, draw)
-
-
-def _digits(ms: float) -> str:
-    return f"{ms:.4g} ms"
 
 
 def _eigenvalues(found: AnalysisResult, command: str) -> Picture:

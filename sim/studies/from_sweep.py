@@ -1,6 +1,5 @@
 """From a finished sweep to what its figures are drawn from, with predictions."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 
 from echelon.errors import UserError
 from echelon.plan.plan import Plan
+from echelon.planning.loading import ScenarioError, read_table
 from echelon.shipped import EFFECTIVE
 from echelon.sim.parts import loading
 from echelon.sim.report.studies.results import Boundary, Columns, Key, Predicted, StudyResults
@@ -32,9 +32,11 @@ def results_of(sweep: Sweep, *, predict: bool = True) -> StudyResults:
     points = dict(sweep.points.columns)
     scenario = _scenario(sweep)
     for key in sweep.keys:  # of which channel a rule is says nothing where the channel varies
-        rule, _, last = key.rpartition(".")
-        if last == "channel" and rule[6:].isdigit() and int(rule[6:]) < len(scenario.get("links", [])):
-            scenario["links"][int(rule[6:])]["channel"] = ""
+        rule, links = key.removeprefix("links.").removesuffix(".channel"), scenario.get("links")
+        if key == f"links.{rule}.channel" and isinstance(links, list):
+            for number, table in enumerate(links):
+                if isinstance(table, dict) and rule in (str(number), table.get("name")):
+                    table["channel"] = ""
     keys = tuple(Key.of(key, points[key].tolist(), scenario) for key in sweep.keys)
     searched = sweep.keys[-1] if sweep.design == "find" else ""
     results = StudyResults(
@@ -57,8 +59,8 @@ def _scenario(sweep: Sweep) -> dict[str, Any]:
     if sweep.folder is None:
         return {}
     try:
-        return tomllib.loads((sweep.folder / EFFECTIVE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_table((sweep.folder / EFFECTIVE).read_text(encoding="utf-8"), EFFECTIVE)
+    except (OSError, ValueError, ScenarioError):
         return {}
 
 

@@ -5,7 +5,7 @@ from itertools import islice
 
 from chaos.attacks import FORGED_TORQUE, Attack, flooding, forged, malformed
 from chaos.frames import Frame, command, feedback, unpack
-from chaos.trial import GROUP
+from chaos.subject import GROUP
 
 ATTACK = Attack("forge_bus", 1, 1.0, GROUP, 4000, 4)
 SENDER = ("192.0.2.9", 4000)

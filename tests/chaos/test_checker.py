@@ -74,10 +74,9 @@ def faultless(clock: Clock = "wall", path: Path = "closed", *hits: Done) -> Evid
         "",
         Heard(frames),
         [Logged(frame.time_ns - FIRST + 1000 * MS, frame.can_id, frame.data) for frame in frames],
-        Recording(True, states, {}, [], ""),
+        Recording(True, states, [], ""),
         None,
         summary,
-        None,
         {robot: list(all_of) for robot, all_of in states.items()} if clock == "virtual" else None,
         [],
     )

@@ -18,7 +18,7 @@ from chaos.evidence import read_can_log, read_recording
 from chaos.frames import COMMAND_ID, ENABLE, FEEDBACK_ID, Frame, command, feedback, pack, torque_frame, unpack
 from chaos.listener import READY, read
 from chaos.plans import ChaosPlan, Hit
-from chaos.trial import GROUP, scenario
+from chaos.subject import GROUP, scenario
 from echelon.bridge.protocols.native.codec import Feedback, NativeCodec, Torque
 from echelon.bridge.protocols.native.counter import COUNTERS
 from support.runs import ROOT, echelon, until

@@ -431,6 +431,7 @@ def test_the_value_of_an_override_is_a_single_value():
         (b"a = " + b"[" * 5000, "not TOML"),
         (b"a = " + b"9" * 5000, "an integer has too many digits"),
         (b"a." * 200_000 + b"b = 1", "not TOML that can be read: a key of 1000 parts or more"),
+        (b'"=".' * 200_000 + b"b = 1", "not TOML that can be read: a key of 1000 parts or more"),
         (b"[" + b"a . " * 200_000 + b"b]", "not TOML that can be read: a key of 1000 parts or more"),
         (b"a\0b = 1", "not TOML: "),
     ],

@@ -4,7 +4,7 @@ import json
 import os
 import stat
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from subprocess import PIPE, Popen
 
@@ -76,6 +76,15 @@ def test_a_run_ends_well_though_an_observer_stands_still(tmp_path: Path) -> None
             frozen.kill()
     assert outcome.failure is None
     assert outcome.trace.digest() == trace_of(plan).digest()
+
+
+@pytest.mark.parametrize("name", ["endpoint", "user", "zenoh_id", "password", "run"])
+def test_a_ticket_with_values_of_other_types_is_one_line(name: str, tmp_path: Path) -> None:
+    supervisor = Supervisor(plan_of("lab"), tmp_path, run="observed", virtual=True, observe=True)
+    assert supervisor.ticket is not None
+    (tmp_path / TICKET).write_text(json.dumps(asdict(supervisor.ticket) | {name: 5}))
+    with pytest.raises(UsageError, match=f"{name}: must be text"):
+        Ticket.read(tmp_path)
 
 
 def test_a_ticket_is_of_no_use_for_writing(tmp_path: Path) -> None:

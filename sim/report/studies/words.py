@@ -61,7 +61,8 @@ def label_of(key: str, scenario: Mapping[str, Any]) -> str:
         return WORDS[key]
     head, *parts = key.split(".")
     last = parts[-1] if parts else head
-    unit = " [s]" if last in SECONDS else ""
+    # an offset is one of a clock, or that of a robot's centre of mass from its axle
+    unit = " [m]" if (head, last) == ("formation", "offset") else " [s]" if last in SECONDS else ""
     if head == "law" and parts[:1] == ["epsilon"] and last.isdigit():
         return f"ratio of time scales ε{int(last) + 1}"
     if head == "links" and len(parts) > 1 and (of := OF_LINKS.get(".".join(parts[1:]))):

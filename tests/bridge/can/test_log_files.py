@@ -141,12 +141,23 @@ def test_a_damaged_line_costs_that_line(suffix: str, tmp_path: Path) -> None:
     assert len(list(frames_in(path))) == len(FRAMES) - 3
 
 
-def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
-    for name in ("x.log", "x.blf"):
-        path = written(tmp_path / name, [message(*timed) for timed in FRAMES] * 200)
-        path.write_bytes(gzip.compress(path.read_bytes())[:-300] if name == "x.log" else path.read_bytes()[:-300])
-        assert len(list(frames_in(path))) > 0 or name == "x.blf"  # a container is read whole or not at all
-        assert left_out(path)[REST] <= 1
+@pytest.mark.parametrize("name", ["x.log", "x.blf"])
+@pytest.mark.parametrize("left", [0.3, 0.6, 0.95])
+def test_a_file_that_is_cut_off_is_read_up_to_there_and_it_is_said(name: str, left: float, tmp_path: Path) -> None:
+    path = written(tmp_path / name, [message(*timed) for timed in FRAMES] * 200)
+    data = gzip.compress(path.read_bytes()) if name == "x.log" else path.read_bytes()
+    path.write_bytes(data[: int(left * len(data))])
+    assert 0 < len(list(frames_in(path))) < 200 * len(FRAMES)
+    assert left_out(path)[REST] == 1
+
+
+@pytest.mark.parametrize("other", ["00000101#11", "101##011"])
+def test_frames_of_other_kinds_do_not_make_a_log_damaged(other: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.log"
+    lines = ["(1.0) can0 101#11", *[f"(1.5) can1 {other}"] * (PATIENCE + 1), "(2.0) can0 101#11"]
+    path.write_text("\n".join(lines) + "\n")
+    assert len(list(frames_in(path))) == 2
+    assert list(left_out(path).values()) == [PATIENCE + 1]
 
 
 def blf(*objects: bytes, method: int = 2) -> bytes:

@@ -59,6 +59,16 @@ def test_a_log_with_another_clock_may_begin_and_end_within_a_run(part: tuple[flo
     assert (report.kinds, report.frames) == ({}, last - first)
 
 
+def test_the_name_of_another_interface_is_told_without_its_control_characters(tmp_path: Path) -> None:
+    path = tmp_path / "other.log"
+    plan, lines = logged(path)
+    path.write_text("".join([*lines, "(1700000000.1) \x1b[31mEVIL\x1b[0m" + "x" * 500 + " 101#11\n"]))
+    ((reason, count),) = judge_log(path, plan).left_out.items()
+    assert count == 1
+    assert reason.isprintable()
+    assert len(reason) < 200
+
+
 def test_frames_of_other_interfaces_are_counted_and_not_judged(tmp_path: Path) -> None:
     path = tmp_path / "other.log"
     plan, lines = logged(path, epoch_ns=WALL_NS)

@@ -13,6 +13,7 @@ from echelon.bridge.protocols.native.host import NativeHost
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.torque_mirror import Stop, TorqueMirror
 from echelon.bridge.timing.bus_load import frame_bits
+from echelon.errors import PartRunError
 from support.bench_drives import drive_plan
 
 MS = 1_000_000
@@ -25,6 +26,21 @@ def make() -> TorqueMirror:
 
 def host(robot: int) -> NativeHost:
     return NativeHost(drive_plan("native", (robot, robot)))
+
+
+def test_a_host_that_fails_at_the_end_keeps_no_other_robot_from_being_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts = [host(0), host(1), host(2)]
+    mirror = TorqueMirror(hosts, 10 * MS)
+    for robot in range(3):
+        mirror.encode(0, robot, 0.1, 0.1, False)
+
+    def fails(*_: object) -> list[Frame]:
+        raise PartRunError("mine.py: raised")
+
+    monkeypatch.setattr(hosts[1], "mirror", fails)
+    frames, failure = mirror.end()
+    assert [robot for robot, _ in frames] == [0, 2]
+    assert str(failure) == "mine.py: raised"
 
 
 def said(robot: int, right: float, left: float, enable: bool, counter: int) -> Torque:

@@ -7,6 +7,7 @@ from itertools import count
 import pytest
 
 from echelon.bridge.can.bus import Bus, open_bus
+from echelon.bridge.can.bus_url import free_multicast_url
 from echelon.bridge.frame_message import NO_BUS, TimedFrame, pack
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.stations import rail as on_bus_module
@@ -68,6 +69,20 @@ def test_a_station_takes_what_the_bus_carried(buses: tuple[Bus, Bus], is_bridge:
     assert heard == [said, None]
     assert rail.foreign == 1
     assert drain(mine) == []
+
+
+def test_who_asks_for_a_frame_is_no_intruder() -> None:
+    """A remote frame or an empty one is foreign, but says nothing in the run's name."""
+    url = free_multicast_url()
+    with open_bus(url, frozenset({OF_BRIDGE[0].frame.can_id})) as mine, open_bus(url) as other:
+        rail = Rail([mine])
+        for data, remote in ((b"", True), (b"", False), (b"forged", False)):
+            other.send(OF_BRIDGE[0].frame.can_id, data, remote=remote)
+        for timed in OF_DRIVES:
+            other.send(timed.frame.can_id, timed.frame.data, remote=timed.frame.remote)
+        station(rail, True, [], []).run(0, [message([*OF_BRIDGE, *OF_DRIVES]), None])
+        assert rail.foreign == 3
+        assert [frames for *_, frames in mine.guard.intrusions] == [1]
 
 
 @pytest.mark.parametrize("spoiled", ["lost", "other data", "wrong order"])

@@ -1,5 +1,7 @@
 """What is estimated from runs agrees with what is exact; plans without chance, for what is exact there alone."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,31 @@ def test_the_rate_of_runs_is_that_of_the_second_moment() -> None:
     assert low < rate < high
     assert rate == pytest.approx(exact, rel=0.3)
     assert OwnLinks(plan, Estimates(plan, 0)).verdict().rate == pytest.approx(exact, rel=1e-6)
+
+
+def test_what_a_trace_loses_is_left_out_by_name(tmp_path: Path) -> None:
+    (tmp_path / "wifi.csv").write_text("0.001\nlost\n0.002\nlost\n")
+    plan = plan_of("lab", f'links=[{{channel="state", delay={{kind="trace", file="{tmp_path / "wifi.csv"}"}}}}]')
+    assert {link.share_lost for link in plan.links} == {0.0, 0.5}
+    assert calm(plan)[1] == "without losses, delays that vary at their mean"
+
+
+def test_blackouts_by_runs_are_those_that_are_exact() -> None:
+    """Also where they begin on the grid of the hyperperiods, and a sum of floats would be an instant later."""
+    events = 'events=[{kind="blackout", at=1.11, duration=0.4}]'
+    plan = plan_of("lab", "duration=10", "avoidance.enabled=false", events)
+    own = OwnLinks(plan, Estimates(plan, 1))
+    (exact,) = own.blackouts()
+    assert exact.method == "exact"
+    (window,) = {window for link in plan.links for window in link.blackouts}
+    links = [link for link in plan.links if link.blackouts]
+    runs = own.runs()
+    assert runs.mean_squares is not None
+    estimated = own._blackout(*window, links, 2)  # as if there were another one
+    assert estimated.method == "estimated"
+    for one, other in zip(estimated.blocks, exact.blocks, strict=True):
+        assert one.block == other.block
+        assert one.peak_time == pytest.approx(other.peak_time, abs=2 * plan.root.period_ns / 1e9)
 
 
 def test_late_references_of_a_formation_that_moves_are_no_growth() -> None:

@@ -417,10 +417,11 @@ def test_a_bring_up_that_misses_its_watchdog_is_armed_again_or_refused(into_the_
         finally:
             kill_session(command.pid)
         assert not ear.enabled
+        assert into_the_run or "s from t = -" not in err  # what is before run time 0 costs time only
         if into_the_run:
             assert code == 3
             assert "drives must be free of faults when a run begins" in err or "bridge stands still" in err
-        elif "bridge stands still" not in err:  # on a busy machine it may stand still for longer
+        elif "bridge stands still" not in err:  # on a busy machine it may stand still later, too
             summary = summary_of(folder / "run")
             solo = summary["can"]["robots"]["solo"]
             assert solo["came_up"] is not None

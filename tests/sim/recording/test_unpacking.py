@@ -5,6 +5,7 @@ import time
 import zlib
 from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
@@ -73,6 +74,23 @@ def test_many_chunks_are_bounded_together(tmp_path: Path) -> None:
         read_trace(path, paper())
     result = recover(path, tmp_path / "mended.mcap")
     assert (result.complete, result.damaged) == (False, len(damaged))
+
+
+@pytest.mark.slow
+def test_chunks_with_wrong_checksums_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chunk takes of the bound what it says, also if it turns out damaged."""
+    data, checked = MESSAGE * (LARGEST_CHUNK // len(MESSAGE)), list[int]()
+    chunk = chunk_of(zstandard.ZstdCompressor().compress(data), len(data), "zstd")
+    chunk.uncompressed_crc = 123
+    path = file_of(tmp_path / "bomb.mcap", *[chunk] * 40)
+    monkeypatch.setattr(
+        "echelon.sim.recording.unpacking.zlib", SimpleNamespace(crc32=lambda data: checked.append(len(data)) or 0)
+    )
+    damaged = list[str]()
+    with pytest.raises(ValueError, match="cut short"):
+        deque(records(path, damaged), maxlen=0)
+    assert len(damaged) == 40
+    assert sum(checked) <= room_of(path.stat().st_size)
 
 
 def test_a_recording_of_another_program_is_one_line(tmp_path: Path) -> None:

@@ -41,3 +41,6 @@ def test_delays_by_runs_are_marked_where_there_are_any(tmp_path: Path) -> None:
         row = LinksResult("class", "intra state", "intra", "state", 9, (), delay, None, runs, None)
         words = texts(_delays(Found, [row], "echelon analyse lab"), tmp_path)  # type: ignore[arg-type]
         assert ("by runs" in words) == (runs is not None)
+        figure = Figure()
+        _delays(Found, [row], "").draw(figure)  # type: ignore[arg-type]
+        assert ("x" in [line.get_marker() for line in figure.axes[0].lines]) == (runs is not None)

@@ -38,6 +38,7 @@ events = [{ kind = "blackout", at = 5.0 }]
         ("periods.acceleration", "acceleration period [s]"),
         ("formation.period", "period of the coordinator [s]"),
         ("formation.groups.g1.period", "period of g1 [s]"),
+        ("formation.groups.g1.robot.offset", "offset of formation groups g1 robot [m]"),
         ("trajectory.anything_else", "anything else of trajectory"),
     ],
 )

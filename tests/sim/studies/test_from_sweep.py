@@ -34,6 +34,16 @@ def test_a_key_that_does_not_take_all_numbers_can_be_drawn(
     assert "integrals" in study_figures(results)
 
 
+@pytest.mark.parametrize("scenario", ["x=" + "[" * 2000, "a." * 2000 + "b=1", "links = 5", "not TOML"])
+def test_a_sweep_whose_scenario_was_spoiled_is_drawn_without_it(scenario: str, tmp_path: Path) -> None:
+    changes = {"links": [{"name": "up", "channel": "group_state"}], "claims": [], "duration": 0.5}
+    vary = {"links.up.channel": ["state", "group_state"], "links.up.delay": [0.0, 0.1]}
+    sweep = echelon.sweep("lab", changes, vary=vary, out=tmp_path, quiet=True)
+    assert [key.label for key in results_of(sweep, predict=False).keys][1] == "delay of links [s]"  # the channel varies
+    (tmp_path / "scenario.toml").write_text(scenario)
+    assert len(results_of(sweep, predict=False).keys) == 2
+
+
 def test_a_search_is_drawn_as_far_as_it_holds_by_both_judgements(tmp_path: Path) -> None:
     changes = {"links": [{"name": "up", "channel": "state"}], "claims": [], "duration": 20.0}
     sweep = echelon.sweep("lab", changes, find={"links.up.delay": "0:1:0.5"}, out=tmp_path, quiet=True)

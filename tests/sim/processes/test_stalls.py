@@ -1,0 +1,48 @@
+"""Who stands still on a wall clock is told, and the bridge of a closed path ends the run, but not before run time 0."""
+
+from __future__ import annotations
+
+import os
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from echelon.sim.processes.failures import RunError
+from echelon.sim.processes.outcome import Progress
+from echelon.sim.processes.stalls import StandstillWatch
+from support.runs import plan_of
+
+S = 1_000_000_000
+
+
+def watch(starts_in_s: float) -> tuple[StandstillWatch, int]:
+    """Returns a watch over a bridge that is late by 1.5 s, and the present instant; the run begins in some seconds."""
+    now_ns = time.monotonic_ns()
+    bridge: Any = SimpleNamespace(
+        name="bridge",
+        kind_and_name="bridge",
+        spec=SimpleNamespace(kind="bridge"),
+        done=None,
+        pulse=SimpleNamespace(overdue_ns=lambda at_ns: max(0, at_ns - now_ns + 3 * S // 2)),
+        process=SimpleNamespace(pid=os.getpid()),
+        state=lambda: "stopped",
+        runs=lambda: "",
+    )
+    progress = Progress(phase="running", started_s=now_ns / 1e9 + starts_in_s)
+    found = StandstillWatch(plan_of("lab", "can.path=closed", "claims=[]"), [bridge], progress)
+    found.check(now_ns)  # the first look: the machine may have been asleep before
+    return found, now_ns
+
+
+def test_a_bridge_that_stands_still_in_the_run_ends_it() -> None:
+    found, now_ns = watch(-10.0)
+    with pytest.raises(RunError, match="bridge stands still"):
+        found.check(now_ns + S // 10)
+
+
+def test_before_run_time_0_no_wheel_has_torque_and_nothing_is_said() -> None:
+    found, now_ns = watch(10.0)
+    found.check(now_ns + S // 10)
+    assert found._progress.note == ""

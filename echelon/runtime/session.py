@@ -142,20 +142,17 @@ class Session:
             handler = zenoh.handlers.Callback(handle, indirect=False)
             self._kept.append(self._session.declare_subscriber(key, handler))
 
-    def inbox(self, keys: str | Iterable[str], high_water: int = 1024) -> Inbox[bytes]:
-        """Returns an inbox for the payloads put under any of `keys`.
-
-        In lockstep, a full inbox blocks everything that this process receives.  So its owner must keep calling `take`, and
-        must not wait for anything else."""
-        inbox: Inbox[bytes] = self._new_inbox(high_water)
-        self.subscribe(keys, inbox.put)
-        return inbox
-
     def checked_inbox(self, doors: Mapping[str, Callable[[bytes], _T | None]], high_water: int = 1024) -> Inbox[_T]:
         """Returns an inbox for what was put under any of the keys of `doors`.
 
-        The function of a key is called in Zenoh's thread with each payload and returns what is to be kept of it, or None."""
-        inbox: Inbox[_T] = self._new_inbox(high_water)
+        The function of a key is called in Zenoh's thread with each payload and returns what is to be kept of it, or None.
+
+        In lockstep, a full inbox blocks everything that this process receives.  So its owner must keep calling `take`, and
+        must not wait for anything else."""
+        # Zenoh's thread needs Python's global lock for each payload; by default a busy thread gives it up only every 5 ms.
+        sys.setswitchinterval(1e-4)
+        inbox = Inbox[_T](high_water, self._lockstep)
+        self._inboxes.append(inbox)
 
         def receiver(check: Callable[[bytes], _T | None]) -> Receive:
             def receive(payload: bytes) -> None:
@@ -166,13 +163,6 @@ class Session:
 
         for key, check in doors.items():
             self.subscribe(key, receiver(check))
-        return inbox
-
-    def _new_inbox(self, high_water: int) -> Inbox[Any]:
-        # Zenoh's thread needs Python's global lock for each payload; by default a busy thread gives it up only every 5 ms.
-        sys.setswitchinterval(1e-4)
-        inbox: Inbox[Any] = Inbox(high_water, self._lockstep)
-        self._inboxes.append(inbox)
         return inbox
 
     def publisher(self, key: str) -> Publisher:

@@ -219,7 +219,7 @@ def test_mail_of_bridge_and_drives_on_a_wall_clock(index: int) -> None:
 class Copies:
     """A reception whose batches come from the test."""
 
-    def __init__(self, plan: Plan, *, virtual: bool, sources: list[int], clock: Any) -> None:
+    def __init__(self, plan: Plan, *, virtual: bool, sources: list[int]) -> None:
         self.kept: list[list[Message]] = []
         spec: Any = SimpleNamespace(plan=plan, run="run", virtual=virtual)
         session: Any = SimpleNamespace(checked_inbox=self._inbox)
@@ -259,7 +259,7 @@ def test_receivers_of_copies(who: str, virtual: bool, monkeypatch: pytest.Monkey
     clock.monotonic_ns, clock.monotonic = lambda: clock.now_ns, lambda: clock.now_ns / 1e9
     monkeypatch.setattr(watchers, "time", clock)
     sources = list(range(9)) if who == "mirroring bridge" else list(speakers(plan, virtual, has_bus=False))
-    copies = Copies(plan, virtual=virtual, sources=sources, clock=clock)
+    copies = Copies(plan, virtual=virtual, sources=sources)
     heard = {}
     for link in plan.links:
         heard[link.source, link.channel] = Heard(
@@ -298,7 +298,7 @@ def test_a_recording_takes_whatever_is_admitted(virtual: bool, tmp_path: Any, mo
     clock.monotonic_ns, clock.monotonic = lambda: clock.now_ns, lambda: clock.now_ns / 1e9
     monkeypatch.setattr(watchers, "time", clock)
     sources = list(speakers(plan, virtual, has_bus=True))
-    copies = Copies(plan, virtual=virtual, sources=sources, clock=clock)
+    copies = Copies(plan, virtual=virtual, sources=sources)
     recording = watchers.RunRecorder(tmp_path, plan, "scenario", {}, keep_going=True)
     luck, fed = np.random.default_rng(2), 0
     wanted = [message for message in messages if message.source in sources]

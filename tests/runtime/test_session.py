@@ -43,6 +43,11 @@ def ready(receiver: Session, sender: Session) -> None:
     assert awaited(sender, "run/@alive/receiver") == set()
 
 
+def inbox_of(session: Session, key: str, high_water: int = 1024) -> Inbox[bytes]:
+    """Returns an inbox that keeps all payloads under a key."""
+    return session.checked_inbox({key: bytes}, high_water)
+
+
 def taken(inbox: Inbox, count: int) -> list[bytes]:
     """Returns `count` payloads from an inbox, or fewer if the others do not come in time."""
     deadline_s = time.monotonic() + TIMEOUT_S
@@ -82,7 +87,7 @@ def hears(connection: Connection) -> object:
 def test_payloads_arrive_whole_and_in_order(stack: ExitStack, tmp_path: Path, lockstep: bool, transport: str) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/s" if transport == "unix" else None
     first, second = pair(stack, lockstep=lockstep, endpoint=endpoint)
-    inbox = first.inbox("run/g1/r1/state")
+    inbox = inbox_of(first, "run/g1/r1/state")
     ready(first, second)
     publisher = second.publisher("run/g1/r1/state")
     sent = [bytes([number]) * (number + 1) for number in range(200)]
@@ -95,13 +100,13 @@ def test_payloads_arrive_whole_and_in_order(stack: ExitStack, tmp_path: Path, lo
 def test_take_waits_at_most_its_timeout(stack: ExitStack) -> None:
     session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
     before = time.monotonic()
-    assert session.inbox("run/state").take(0.05) == []
+    assert inbox_of(session, "run/state").take(0.05) == []
     assert time.monotonic() - before >= 0.05
 
 
 def test_a_handler_may_put(stack: ExitStack) -> None:
     first, second = pair(stack)
-    answers = second.inbox("run/answer")
+    answers = inbox_of(second, "run/answer")
     answer = first.publisher("run/answer").put
     first.subscribe(["run/question", "run/other"], lambda payload: answer(payload + b"!"))
     second.declare_token("run/@alive/second")
@@ -115,7 +120,7 @@ def test_a_handler_may_put(stack: ExitStack) -> None:
 
 def test_a_session_receives_its_own_payloads(stack: ExitStack) -> None:
     session = stack.enter_context(Session(listen=[], connect=[], lockstep=True))
-    inbox = session.inbox("run/**")
+    inbox = inbox_of(session, "run/**")
     session.publisher("run/state").put(b"x")
     assert taken(inbox, 1) == [b"x"]
 
@@ -123,7 +128,7 @@ def test_a_session_receives_its_own_payloads(stack: ExitStack) -> None:
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_long_payloads_arrive(stack: ExitStack, lockstep: bool) -> None:
     first, second = pair(stack, lockstep=lockstep)
-    inbox = first.inbox("run/state")
+    inbox = inbox_of(first, "run/state")
     ready(first, second)
     publisher, found = second.publisher("run/state"), list[bytes]()
     for _ in range(1 if lockstep else 600):  # on a wall clock a busy machine may drop a message
@@ -169,7 +174,7 @@ def test_missing_tokens_are_named(stack: ExitStack) -> None:
 
 def _listen_late(endpoint: str, parent: Connection) -> None:
     with Session(listen=[endpoint], connect=[], lockstep=True) as session:
-        inbox = session.inbox("run/state")
+        inbox = inbox_of(session, "run/state")
         session.declare_token("run/@alive/late")
         parent.send(taken(inbox, 100))
 
@@ -197,7 +202,7 @@ def _put_and_close(endpoint: str, parent: Connection) -> None:
 def test_close_delivers_what_was_put_last(stack: ExitStack) -> None:
     (endpoint,) = loopback_endpoints(1)
     session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=True))
-    inbox = session.inbox("run/state")
+    inbox = inbox_of(session, "run/state")
     session.declare_token("run/@alive/receiver")
     process, _ = child(stack, _put_and_close, endpoint)
     assert taken(inbox, 100) == [b"%d" % number for number in range(100)]
@@ -239,7 +244,7 @@ def _flood(endpoint: str, parent: Connection) -> None:
 def test_back_pressure_slows_the_sender_and_loses_nothing(stack: ExitStack) -> None:
     (endpoint,) = loopback_endpoints(1)
     session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=True))
-    inbox = session.inbox("run/state", 8)
+    inbox = inbox_of(session, "run/state", 8)
     session.declare_token("run/@alive/receiver")
     _, parent = child(stack, _flood, endpoint)
     begun = -1
@@ -274,7 +279,7 @@ def test_a_session_with_a_full_inbox_can_be_closed(stack: ExitStack) -> None:
     (endpoint,) = loopback_endpoints(1)
     session = Session(listen=[endpoint], connect=[], lockstep=True)
     closing = threading.Thread(target=session.close, daemon=True)
-    inbox = session.inbox("run/state", 8)
+    inbox = inbox_of(session, "run/state", 8)
     room = inbox._room = _Room()
     session.declare_token("run/@alive/receiver")
     _, _flood_says = child(stack, _flood, endpoint)
@@ -286,7 +291,7 @@ def test_a_session_with_a_full_inbox_can_be_closed(stack: ExitStack) -> None:
 
 def _relay(endpoint: str, parent: Connection) -> None:
     with Session(listen=[endpoint], connect=[], lockstep=True, own_receiver=True) as session:
-        inbox = session.inbox("run/state", 8)
+        inbox = inbox_of(session, "run/state", 8)
         assert awaited(session, "run/@alive/end") == set()
         publisher = session.publisher("run/relayed")
         session.declare_token("run/@alive/receiver")
@@ -300,7 +305,7 @@ def test_a_relay_that_is_blocked_on_both_sides_goes_on(stack: ExitStack) -> None
     (endpoint,) = loopback_endpoints(1)
     child(stack, _relay, endpoint)
     session = stack.enter_context(Session(listen=[], connect=[endpoint], lockstep=True))
-    inbox = session.inbox("run/relayed", 8)
+    inbox = inbox_of(session, "run/relayed", 8)
     session.declare_token("run/@alive/end")
     _, flood = child(stack, _flood, endpoint)
     begun = -1
@@ -322,7 +327,7 @@ def test_a_relay_that_is_blocked_on_both_sides_goes_on(stack: ExitStack) -> None
 
 def test_on_the_wall_clock_the_newest_are_kept(stack: ExitStack) -> None:
     session = stack.enter_context(Session(listen=[], connect=[], lockstep=False))
-    inbox: Inbox = session.inbox("run/state", 4)
+    inbox: Inbox = inbox_of(session, "run/state", 4)
     publisher = session.publisher("run/state")
     for number in range(100):
         publisher.put(b"%d" % number)
@@ -332,7 +337,7 @@ def test_on_the_wall_clock_the_newest_are_kept(stack: ExitStack) -> None:
 
 def _stop_there(endpoint: str, parent: Connection) -> None:
     with Session(listen=[], connect=[endpoint], lockstep=False) as session:
-        session.inbox("run/state")
+        inbox_of(session, "run/state")
         session.declare_token("run/@alive/stopped")
         parent.recv()
 
@@ -340,7 +345,7 @@ def _stop_there(endpoint: str, parent: Connection) -> None:
 def test_on_the_wall_clock_a_stopped_peer_blocks_no_put(stack: ExitStack) -> None:
     (endpoint,) = loopback_endpoints(1)
     session = stack.enter_context(Session(listen=[endpoint], connect=[], lockstep=False))
-    inbox = session.inbox("run/state")
+    inbox = inbox_of(session, "run/state")
     process, _ = child(stack, _stop_there, endpoint)
     assert awaited(session, "run/@alive/stopped") == set()
     assert process.pid is not None

@@ -11,6 +11,8 @@ from echelon.bridge.can.canlog import EPOCH_NS
 from echelon.cli import main
 from echelon.cli.showing import show_growing
 from echelon.sim.interruption import SIGNALS, Raises, interruption
+from echelon.sim.processes.watchers import RunRecorder
+from echelon.sim.recording.mcap_reader import read_trace
 from echelon.sim.run_folder import open_run
 from echelon.sim.run_state import goes_on, read_state
 from support.runs import echelon, plan_of, start_echelon, summary_of, until
@@ -97,6 +99,24 @@ def interrupted(folder: Path, scenario: str, *options: str) -> dict[str, Any]:
     assert command.returncode == 3
     assert err.splitlines()[-1] == "echelon: interrupted"
     return summary_of(folder)
+
+
+def test_signals_while_a_run_in_one_process_ends_cost_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    close, calls = RunRecorder.close, list[int]()
+
+    def signalled(self: RunRecorder, *links: Any) -> None:
+        for _ in range(3):
+            calls.append(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        close(self, *links)
+
+    monkeypatch.setattr(RunRecorder, "close", signalled)
+    monkeypatch.setattr("echelon.sim.interruption.SAME_S", 0.0)
+    run = ("--engine", "inprocess", "--set", "duration=0.5", "--set", "claims=[]", "--quiet", "--no-report")
+    assert main(["run", "lab", *run, "--out", str(tmp_path / "run")]) in (0, 1, 3)
+    assert len(calls) == 3
+    assert summary_of(tmp_path / "run")["simulated"] == 0.5
+    assert len(read_trace(tmp_path / "run" / "run.mcap", plan_of("lab", "duration=0.5")).times_ns[0]) > 40
 
 
 @pytest.mark.parametrize("scenario", ["lab", "drives"])

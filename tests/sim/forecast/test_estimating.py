@@ -29,6 +29,16 @@ def test_the_rate_of_runs_is_that_of_the_second_moment() -> None:
     assert OwnLinks(plan, Estimates(plan, 0)).verdict().rate == pytest.approx(exact, rel=1e-6)
 
 
+def test_later_links_share_one_table_of_delays() -> None:
+    plan = plan_of("lab", 'links=[{channel="state", delay={kind="gamma", min=0.005, shape=2.0, scale=0.004}}]')
+    moved = later(plan, Channel.STATE, 1_000_000)
+    tables = {id(link.delays) for link in moved.links if link.delays is not None}
+    assert len(tables) == len({id(link.delays) for link in plan.links if link.delays is not None}) == 1
+    for link, before in zip(moved.links, plan.links, strict=True):
+        if link.delays is not None and before.delays is not None:
+            assert link.delays.delays_ns == tuple(each + 1_000_000 for each in before.delays.delays_ns)
+
+
 def test_what_a_trace_loses_is_left_out_by_name(tmp_path: Path) -> None:
     (tmp_path / "wifi.csv").write_text("0.001\nlost\n0.002\nlost\n")
     plan = plan_of("lab", f'links=[{{channel="state", delay={{kind="trace", file="{tmp_path / "wifi.csv"}"}}}}]')

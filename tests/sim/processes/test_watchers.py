@@ -12,7 +12,6 @@ import pytest
 from echelon.bridge.frame_message import TimedFrame, pack
 from echelon.bridge.protocols.frame import Frame
 from echelon.messages import NULL, Channel, Message
-from echelon.plan.plan import Plan
 from echelon.runtime.admission import AGAIN, EMPTY, FUTURE, MISSHAPEN, OF_ANOTHER, TIME, VALUES
 from echelon.runtime.session import Session
 from echelon.runtime.wire import encode, join
@@ -30,10 +29,10 @@ TICKS = 6
 class Run:
     """Stands for the session: each `take` lets the next portion of batches through the doors; then there is nothing."""
 
-    def __init__(self, *portions: list[tuple[int, bytes]], virtual: bool = True, plan: Plan | None = None) -> None:
+    def __init__(self, *portions: list[tuple[int, bytes]], virtual: bool = True) -> None:
         """A portion is a list of sources and their batches."""
         self.portions = list(portions)
-        plan = plan or paper()
+        plan = paper()
         sources = speakers(plan, virtual, has_bus=True)
         spec: Any = SimpleNamespace(plan=plan, run="test", virtual=virtual)
         self.doors: list[Any] = []

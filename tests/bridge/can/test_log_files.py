@@ -168,6 +168,28 @@ def blf(*objects: bytes, method: int = 2) -> bytes:
     return empty.ljust(144, b"\0") + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed), 10) + packed
 
 
+@pytest.mark.parametrize("damage", ["", "plain and cut", "half of what was packed"])
+def test_a_blf_file_is_whole_or_it_is_said(damage: str, tmp_path: Path) -> None:
+    """A container that is not packed may be cut; one that is packed may lack a part though its size is right."""
+    data = written(tmp_path / "whole.blf", [message(*timed) for timed in FRAMES]).read_bytes()
+    (header,) = struct.unpack_from("<L", data, 4)
+    (size,) = struct.unpack_from("<L", data, header + 8)
+    content = zlib.decompress(data[header + 32 : header + size])
+    whole = blf(content, method=0)
+    path, count = tmp_path / "x.blf", len(FRAMES)
+    match damage:
+        case "plain and cut":
+            path.write_bytes(whole[: len(whole) - len(content) // 2])
+        case "half of what was packed":
+            half = zlib.compress(content, 0)[: len(content) // 2]  # not made smaller, so half of it holds frames
+            packed = struct.pack("<H6xL4x", 2, len(content)) + half
+            path.write_bytes(whole[:144] + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed), 10) + packed)
+        case _:
+            path.write_bytes(whole)
+    found = len(list(frames_in(path)))
+    assert (0 < found < count, left_out(path)[REST]) == ((True, 1) if damage else (False, 0))
+
+
 @pytest.mark.parametrize(
     "content",
     [

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from echelon.controller.prediction.blackout import effect
 from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.linear_run import edges_of, later, ruled_links
 from echelon.controller.prediction.mean_square import Losses
@@ -44,6 +45,20 @@ def test_what_a_trace_loses_is_left_out_by_name(tmp_path: Path) -> None:
     plan = plan_of("lab", f'links=[{{channel="state", delay={{kind="trace", file="{tmp_path / "wifi.csv"}"}}}}]')
     assert {link.share_lost for link in plan.links} == {0.0, 0.5}
     assert calm(plan)[1] == "without losses, delays that vary at their mean"
+
+
+@pytest.mark.parametrize("begin_ms", range(10, 2000, 70))
+def test_a_blackout_begins_at_the_first_instant_that_it_holds(begin_ms: int) -> None:
+    """Errors grow in it from 1 to 2 at its second instant, and are 1.5 and 0.5 after it."""
+    begin = -(-begin_ms // 10)
+    errors = np.full(300, 0.5)
+    errors[begin : begin + 3] = 1.0, 2.0, 1.5
+    found = effect("inter", errors, 10_000_000, begin_ms * 1_000_000, (begin_ms + 20) * 1_000_000)
+    assert (found.peak, found.peak_time) == (2.0, pytest.approx((begin + 1) / 100))
+    assert found.recovery == pytest.approx(0.01)  # at its end the error is 1.5, an instant later below 1
+    at_its_begin = effect("inter", np.where(errors == 2.0, 0.5, errors), 10_000_000, begin_ms * 1_000_000, 10**11)
+    assert at_its_begin.peak_time == pytest.approx((begin + 2) / 100)
+    assert effect("inter", np.full(300, 1.0), 10_000_000, 10**11, 2 * 10**11).peak_time == pytest.approx(2.99)
 
 
 def test_blackouts_by_runs_are_those_that_are_exact() -> None:

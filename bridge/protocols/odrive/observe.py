@@ -6,7 +6,6 @@ mean over the period before it.
 kind of finding                    meaning
 command, length, not finite        an invalid frame
 state                              a heartbeat with an unknown axis state
-heartbeat missing                  no heartbeat for one and a half of its periods
 torque above limit                 a commanded torque exceeds the envelope's
 torque while idle                  an axis reports torque though it was IDLE for the reported time
 torque after silence               an axis reports torque though nothing fed its watchdog in time
@@ -39,10 +38,6 @@ class _Axis:
     """A Set_Axis_State(8) was seen since the last heartbeat in CLOSED_LOOP_CONTROL"""
     idle_ns: int | None = None
     """Heartbeat since which the axis is certainly IDLE, without a request to leave it"""
-    alive_ns: int | None = None
-    """Time of the last heartbeat, or of the first frame if there was none"""
-    missing: bool = False
-    """The missing heartbeat was reported as a finding"""
     fed_ns: int | None = None
     """Time of the last frame that feeds the watchdog, or of the first frame if there was none"""
 
@@ -62,7 +57,6 @@ class ODriveObserver:
         }
         self._identifiers = frozenset(self._by_id)
         periods_ns = (config or ODriveConfig()).periods_ns(plan)
-        self._heartbeat_ns = periods_ns.get(Command.HEARTBEAT)
         self._cyclic = {
             frame_id(node, command): period
             for node in plan.node_ids
@@ -86,9 +80,8 @@ class ODriveObserver:
             return []
         axis, number = found
         wrong: list[tuple[str, str]] = []
-        if axis.alive_ns is None:
-            axis.alive_ns = axis.fed_ns = time_ns
-        self._check_alive(axis, time_ns, number, wrong)
+        if axis.fed_ns is None:
+            axis.fed_ns = time_ns
         message = MESSAGES.get(number)
         if message is None:
             wrong.append(("command", f"command {number:#04x} is none of CANSimple's"))
@@ -102,16 +95,6 @@ class ODriveObserver:
             else:
                 self._read(axis, time_ns, message.command, values, wrong)
         return [Finding(time_ns, frame.can_id, str(kind), text) for kind, text in wrong]
-
-    def _check_alive(self, axis: _Axis, time_ns: int, number: int, wrong: list[tuple[str, str]]) -> None:
-        if self._heartbeat_ns is None or axis.alive_ns is None:
-            return
-        gap_ns = time_ns - axis.alive_ns
-        if gap_ns > 1.5 * self._heartbeat_ns and not axis.missing:
-            axis.missing = True
-            wrong.append(("heartbeat missing", f"none for {gap_ns / 1e6:.0f} ms"))
-        if number == Command.HEARTBEAT:
-            axis.alive_ns, axis.missing = time_ns, False
 
     def _read(
         self, axis: _Axis, time_ns: int, command: Command, values: tuple[float, ...], wrong: list[tuple[str, str]]

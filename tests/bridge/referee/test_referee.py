@@ -129,7 +129,25 @@ def test_a_frame_that_is_missing(protocol: str, data: st.DataObject) -> None:
     assert referee.kinds["gap"] >= 1
     assert {row.id for row in referee.kept if row.kind == "gap"} == {f"{frames[at][2].can_id:03X}"}
     # if the largest command is missing, the torque that it caused was not commanded
-    assert set(referee.kinds) <= {"gap", "counter gap", "heartbeat missing", "torque not commanded"}
+    assert set(referee.kinds) <= {"gap", "counter gap", "torque not commanded"}
+
+
+@pytest.mark.parametrize(
+    ("tolerance_ns", "found"), [(None, {"gap"}), (30 * MS, {"gap"}), (250 * MS, set())], ids=["default", "30", "250"]
+)
+def test_heartbeats_that_are_late_are_judged_as_all_cyclic_frames_are(
+    tolerance_ns: int | None, found: set[str]
+) -> None:
+    plan, frames = run("odrive")
+    (heartbeat, *_) = sorted({frame.can_id for _, _, frame in frames if frame.can_id & 31 == 1})
+    late = [one for one in frames if one[2].can_id != heartbeat or not 300 * MS < one[0] < 490 * MS]
+    assert len(frames) - len(late) == 2
+    referee = Referee(plan, tolerance_ns=tolerance_ns)
+    for one in late:
+        referee.observe(*one)
+    assert set(referee.kinds) == found
+    never = [one for one in frames if one[2].can_id != heartbeat]
+    assert judged(plan, never).kinds == {"missing": 1}
 
 
 @each_protocol

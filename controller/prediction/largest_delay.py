@@ -4,7 +4,9 @@ All of these links get the same delay more, beyond what they have.  Where nodes 
 message is used at instants of its receiver, and said at instants of its source.  Where they are event-driven, delays between
 ticks count, and a message that comes just after an instant may be worse than one that comes at the next: a delay of 9.9 ms may
 be unstable where 10 ms are stable.  So the first tick is searched for at whose end, just before the next, the run is unstable;
-the boundary lies in this tick.
+the boundary lies in this tick.  With less than a hyperperiod such a node waits for a message of the same period; with more, in
+a chain of late links, it may act at another instant with the message before.  So between ticks less than a hyperperiod is tried
+by itself, and the rest is counted from one hyperperiod on.
 
 A *tick* is what divides the periods of all links and stages concerned, and the hyperperiod is m ticks.  A delay of k ticks more
 is q hyperperiods and r ticks, k = q m + r with 0 ≤ r < m.  For each r the linear run with r ticks more is cut open where the
@@ -171,10 +173,11 @@ class _Search:
             return None
         f = 0.5
         for _ in range(STEPS):
-            cut = self._cut(round(f * self._tick_ns))
-            if cut.found is None or (edge := smallest_delay(cut.found)) == inf:
+            part_ns = round(f * self._tick_ns)
+            cut, before = self._cut(part_ns), self._before(part_ns)
+            if ticks < before or not cut.is_stable or cut.found is None or (edge := smallest_delay(cut.found)) == inf:
                 return None
-            step = edge - ticks
+            step = before + edge - ticks
             f += step
             if not 0 <= f < 1:
                 return None
@@ -188,15 +191,25 @@ class _Search:
     def _bears(self, extra_ns: int) -> bool:
         """Returns whether the run is stable with all these messages later."""
         whole, part_ns = divmod(extra_ns, self._run.hyperperiod_ns)
-        cut = self._cut(part_ns)
-        if cut.found is not None and cut.is_stable:
-            return unstable_roots(cut.found, whole) <= 0
+        before = self._before(part_ns)
+        if whole >= before:
+            cut = self._cut(part_ns)
+            if cut.found is not None and cut.is_stable:
+                return unstable_roots(cut.found, whole - before) <= 0
         return spectral_radius(LinearRun(later(self._patient, self._late, extra_ns)).map()) < 1
 
+    def _before(self, part_ns: int) -> int:
+        """Returns how many hyperperiods more a run has before it is cut open: one for delays between ticks.
+
+        With less than a hyperperiod an event-driven node waits for a message of the same period.  With more it does not, and in
+        a chain of late links may use the one before, at another instant: the run is another one."""
+        return 1 if part_ns % self._tick_ns else 0
+
     def _cut(self, extra_ns: int) -> Cut:
-        """Returns the run with these messages later, cut open."""
+        """Returns the run with these messages later, and by `_before` hyperperiods more, cut open."""
         if extra_ns not in self._cuts:
-            run = LinearRun(later(self._patient, self._late, extra_ns))
+            before_ns = self._before(extra_ns) * self._run.hyperperiod_ns
+            run = LinearRun(later(self._patient, self._late, extra_ns + before_ns))
             self._cuts[extra_ns] = Cut(run, self._late, self._window)
         return self._cuts[extra_ns]
 
@@ -210,14 +223,17 @@ class _Search:
         for r in range(m if m <= REMAINDERS else 1):
             if r >= least:
                 break
-            cut = self._cut(r * self._tick_ns + part_ns)
-            if not cut.is_stable:
+            extra_ns = r * self._tick_ns + part_ns
+            cut, before = self._cut(extra_ns), self._before(extra_ns)
+            if before and not self._bears(extra_ns):
                 least = r
                 break
-            if cut.found is None:
+            if not cut.is_stable:
+                least = min(least, before * m + r)
+            elif cut.found is None:
                 return None
-            if (q := cut.first_unstable()) is not None:
-                least = min(least, q * m + r)
+            elif (q := cut.first_unstable()) is not None:
+                least = min(least, (q + before) * m + r)
         if least == inf:
             return -1
         k = int(least)

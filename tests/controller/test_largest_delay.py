@@ -154,10 +154,28 @@ def test_what_limits_a_delay_is_the_fastest_block_of_its_loop():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2])
+@pytest.mark.parametrize(
+    ("seed", "name"), [(7, "middle group_state"), (7, "middle reference"), (17, "middle reference")]
+)
+def test_in_a_chain_of_late_links_every_delay_up_to_the_largest_is_stable(seed, name):
+    """A node that waits for a message of the same period acts at another instant than with a period more."""
+    plan = at_rest(random_formation(seed))
+    (late,) = (one.edges for one in link_sets(plan) if (one.kind, one.name) == ("class", name))
+    found = largest_extra_delay(plan, late)
+    assert found.seconds is not None
+
+    def radius(seconds):
+        return spectral_radius(LinearRun(later(plan, late, round(seconds * 1e9))).map())
+
+    for share in np.linspace(0.02, 0.999, 30):
+        assert radius(share * found.seconds) < 1
+    assert radius(1.003 * found.seconds) >= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 5, 7, 8])
 def test_points_of_random_formations_grow_beyond_the_largest_delay_and_not_before(seed, monkeypatch):
-    """A tree of up to four layers, several periods, full gains and couplings: the engine with points, each link class.  Robots
-    of five such trees are in tests/sim/batch/test_delay_boundary.py."""
+    """Trees of up to four layers, several periods, full gains and couplings: the engine with points, each link class."""
     plan = at_rest(random_formation(seed))
     assert 2 <= layers_of(seed) <= 4
     for one in link_sets(plan):

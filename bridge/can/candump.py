@@ -8,6 +8,7 @@ Hexadecimal digits may be of either case, and seconds may have any number of dec
 """
 
 import re
+from binascii import unhexlify
 from calendar import timegm
 from typing import Final, NamedTuple
 
@@ -21,7 +22,7 @@ FLEXIBLE: Final = "CAN FD frames"
 ERRORS: Final = "error frames"
 
 _LOGGED: Final = re.compile(
-    r"\((\d{1,12})\.(\d{1,12})\) (\S+) ([0-9A-Fa-f]{3})#(?:(R)[0-8]?|((?:[0-9A-Fa-f]{2}){0,8}))(?:_[0-9A-Fa-f])?(?: [A-Z])*"
+    rb"\s*\((\d{1,12})\.(\d{1,12})\) (\S+) ([0-9A-Fa-f]{3})#(?:([0-9A-Fa-f]{0,16})|R[0-8]?)(?:_[0-9A-Fa-f])?(?: [A-Z])*\s*"
 )
 _LOGGED_OTHER: Final = re.compile(r"\(\d+\.\d+\) \S+ ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(#?)(?:R[0-8]?|[0-9A-Fa-f]*)\b.*")
 _SHOWN: Final = re.compile(
@@ -48,20 +49,23 @@ class LeftOut(NamedTuple):
     """True if it may have been such a frame: then the log lacks a frame that was on the bus"""
 
 
-def read_line(line: str) -> Logged | LeftOut | None:
+def read_line(line: bytes) -> Logged | LeftOut | None:
     """Returns what a line of candump says; None for a blank line."""
-    line = line.strip()
     if match := _LOGGED.fullmatch(line):
-        seconds, decimals, channel, identifier, remote, data = match.groups()
-        frame = Frame(int(identifier, 16) & 0x7FF, bytes.fromhex(data or ""), remote is not None)
-        return Logged(_time_ns(seconds, decimals), channel, frame)
-    if not line:
+        seconds, decimals, channel, identifier, data = match.groups()
+        if data is not None and len(data) % 2:
+            return LeftOut(NOT_READ, True)
+        frame = Frame(int(identifier, 16) & 0x7FF, unhexlify(data or b""), data is None)
+        time_ns = int(seconds) * 1_000_000_000 + int(decimals[:_DIGITS].ljust(_DIGITS, b"0"))
+        return Logged(time_ns, channel.decode("ascii", "replace"), frame)
+    text = line.decode("ascii", "replace").strip()
+    if not text:
         return None
-    if match := _LOGGED_OTHER.fullmatch(line):
-        identifier, flexible = match.groups()
+    if other := _LOGGED_OTHER.fullmatch(text):
+        identifier, flexible = other.groups()
         return _other(identifier, bool(flexible)) or LeftOut(NOT_READ, True)
-    if match := _SHOWN.fullmatch(line):
-        return _shown(match)
+    if shown := _SHOWN.fullmatch(text):
+        return _shown(shown)
     return LeftOut(NOT_READ, True)
 
 
@@ -81,7 +85,8 @@ def _shown(match: re.Match[str]) -> Logged | LeftOut:
             return LeftOut(NOT_READ, True)
         # only differences count, so the time zone does not matter
         seconds = str(max(0, timegm((year, month, day, hour, minute, int(seconds), 0, 0, 0))))
-    return Logged(_time_ns(seconds, decimals), channel, Frame(int(identifier, 16) & 0x7FF, data, remote))
+    time_ns = int(seconds) * 1_000_000_000 + int(decimals[:_DIGITS].ljust(_DIGITS, "0"))
+    return Logged(time_ns, channel, Frame(int(identifier, 16) & 0x7FF, data, remote))
 
 
 def _other(identifier: str, flexible: bool) -> LeftOut | None:
@@ -91,7 +96,3 @@ def _other(identifier: str, flexible: bool) -> LeftOut | None:
     if len(identifier) == 8:
         return LeftOut(ERRORS if int(identifier, 16) & _ERROR_FLAG else EXTENDED)
     return None
-
-
-def _time_ns(seconds: str, decimals: str) -> int:
-    return int(seconds) * 1_000_000_000 + int(decimals[:_DIGITS].ljust(_DIGITS, "0"))

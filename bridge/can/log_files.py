@@ -76,7 +76,7 @@ def frames_in(path: Path) -> Iterator[Logged]:
     return (entry for entry in read_log(path) if isinstance(entry, Logged))
 
 
-def read_lines(lines: Iterable[str]) -> Iterator[Logged | LeftOut]:
+def read_lines(lines: Iterable[bytes]) -> Iterator[Logged | LeftOut]:
     """Yields the frames in candump's lines, and what else they hold."""
     for line in lines:
         if (entry := read_line(line)) is not None:
@@ -102,8 +102,8 @@ def _of_candump(file: IO[bytes]) -> Iterator[Logged | LeftOut]:
     shown_ns: dict[str, int] = {}
     while line := file.readline(LONGEST_LINE):
         began, whole = whole, line.endswith(b"\n")
-        entry = read_line(line.decode("ascii", errors="replace")) if began else None
-        if isinstance(entry, Logged) and b"[" in line:
+        entry = read_line(line) if began else None
+        if b"[" in line and isinstance(entry, Logged):
             if entry.time_ns < shown_ns.get(entry.channel, 0):
                 entry = LeftOut(BACKWARDS, True)
             elif len(shown_ns) < INTERFACES or entry.channel in shown_ns:

@@ -100,6 +100,8 @@ class _Wheel:
 
     def __init__(self, plan: EnvelopePlan) -> None:
         self.plan = plan
+        # torques within the limit are at most twice the limit apart
+        self._windowed = plan.window_limit < 2 * plan.torque_limit
 
     def stop(self, now_ns: float) -> None:
         self.sent = 0.0
@@ -117,7 +119,10 @@ class _Wheel:
             return Rejection.RISE
         if before - plan.fall_limit > common:
             return Rejection.FALL
-        if _largest(self.highs, now_ns, torque) + _largest(self.lows, now_ns, -torque) > plan.window_limit:
+        if (
+            self._windowed
+            and _largest(self.highs, now_ns, torque) + _largest(self.lows, now_ns, -torque) > plan.window_limit
+        ):
             return Rejection.WINDOW
         self.sent = torque
         return None

@@ -87,8 +87,8 @@ class TorqueMirror:
             counts.repeated += 1
             return []
         counts.last_ns = time_ns
-        if last is not None:
-            counts.skipped += max(0, (time_ns - last + self._period_ns[robot] // 2) // self._period_ns[robot] - 1)
+        if last is not None and (passed_ns := time_ns - last) != (period_ns := self._period_ns[robot]):
+            counts.skipped += max(0, (passed_ns + period_ns // 2) // period_ns - 1)
         if not (math.isfinite(tau_right) and math.isfinite(tau_left)):
             return self.stop(robot, Stop.NOT_FINITE)
         (low_right, low_left), (high_right, high_left) = counts.smallest, counts.largest

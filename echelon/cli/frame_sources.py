@@ -143,11 +143,11 @@ def follow(folder: Path, plan: Plan, seconds: float | None) -> Iterator[Heard]:
         yield Heard(0, 0, None)
         time.sleep(TICK_S)
     try:
-        with path.open(encoding="ascii", errors="replace") as log:
-            rest, over = "", False
+        with path.open("rb") as log:
+            rest, over = b"", False
             while not over and (seconds is None or time.monotonic() - start_s < seconds):
                 over = not goes_on(folder)  # asked before the log is read, so that nothing written in between is missed
-                *lines, rest = (rest + log.read(_AT_ONCE_BYTES)).split("\n")
+                *lines, rest = (rest + log.read(_AT_ONCE_BYTES)).split(b"\n")
                 for time_ns, bus, frame in PlanLog(read_lines(lines), plan).frames():
                     yield Heard(time_ns, bus, frame)
                 if lines:

@@ -21,9 +21,9 @@ STALL_S: Final = 1.0
 """After this time without movement a lockstep reports which members it waits for, and goes on waiting [s]."""
 BATCH_BYTES: Final = 12_000
 """Size of a batch of copies in virtual time [bytes], about; batches need far fewer deliveries than single messages."""
-BATCH_NS: Final = 80_000_000
-"""Run time that a batch spans at most [ns].  Batches that are not sent are lost if the process is killed: with those that wait
-this must stay below 0.2 s."""
+BATCH_S: Final = 0.08
+"""Wall time after which a batch is sent even if it is small [s].  Copies that are not sent are lost if the process is killed:
+with those on their way into the recording this must stay below 0.2 s."""
 MAX_BATCHES: Final = 2
 """Number of batches that may wait for a slow receiver of copies; with more the role waits, too."""
 STRETCH: Final = 64
@@ -51,7 +51,6 @@ class LockstepRunner(Runner):
             mailbox,
             watched=watched,
             batch_bytes=BATCH_BYTES,
-            batch_ns=BATCH_NS,
             virtual=True,
             frames=frames,
         )
@@ -63,12 +62,14 @@ class LockstepRunner(Runner):
             state             entered when                                  what happens, and what ends it
             ----------------  --------------------------------------------  ----------------------------------------------
             main thread       the start; a batch of copies is complete;     the main thread sends batches and runs stages;
-                              the handler has run `STRETCH` stages          it ends when a stage misses a message
+                              the handler has run `STRETCH` stages;         it ends when a stage misses a message
+                              after `BATCH_S`
             handler           a stage misses a message                      Zenoh's thread runs the stages that a message
                                                                             completes; the main thread sleeps
             finished          the last instant of the plan is over          the main thread sends the last batch and returns
         """
-        last_moved = -1
+        wait_s = STALL_S if self._copies is None else min(BATCH_S, STALL_S)
+        moved, still = -1, 0
         while True:
             with self._lock:
                 self._take_aside()
@@ -81,23 +82,24 @@ class LockstepRunner(Runner):
                 self._copies.send()
             if finished:
                 return
-            if not self._wait_for_wake():
+            if not self._wait_for_wake(wait_s):
                 with self._lock:
                     missing = [] if self._finished else self._mailbox.missing(self._at, self._time_ns)
+                    still = still + 1 if moved == self._moved else 0
                     moved, time_ns = self._moved, self._time_ns
                     if self._copies is not None:
                         self._copies.close()
-                if moved == last_moved and missing:
+                if still * wait_s >= STALL_S and missing:
+                    still = 0
                     on_wait(time_ns, [link.plan.source for link in missing])
-                last_moved = moved
             self._wake.clear()
 
-    def _wait_for_wake(self) -> bool:
-        """Waits until the main thread has work; returns False after `STALL_S` without any."""
+    def _wait_for_wake(self, wait_s: float) -> bool:
+        """Waits until the main thread has work; returns False if it has none for `wait_s`."""
         self._idle = True
         if self._stopping:
             raise SystemExit(0)
-        woken = not self._in_handler or self._wake.wait(STALL_S)
+        woken = not self._in_handler or self._wake.wait(wait_s)
         self._idle = False
         return woken
 

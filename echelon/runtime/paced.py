@@ -55,7 +55,6 @@ class PacedRunner(Runner):
             self._inbox,
             watched=watched,
             batch_bytes=0,
-            batch_ns=0,
             virtual=False,
             every_ns=every_ns,
         )

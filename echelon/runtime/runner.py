@@ -41,24 +41,20 @@ class RunnerCounts:
 class CopyBatcher:
     """Gathers copies of a member's messages into batches, for the recorder and other observers.
 
-    A batch is complete when it has `limit` bytes or spans `span_ns` of run time.  If the process is killed before, the batch is
-    lost."""
+    A batch is complete when it has `limit` bytes or is closed.  If the process is killed before it is sent, it is lost."""
 
-    def __init__(self, publisher: Publisher, limit: int, span_ns: int) -> None:
-        self._put, self._limit, self._span_ns = publisher.put, limit, span_ns
-        self._first_ns = 0
+    def __init__(self, publisher: Publisher, limit: int) -> None:
+        self._put, self._limit = publisher.put, limit
         self._payloads: list[bytes] = []
         self._size = 0
         self.batches: list[bytes] = []
         """Complete batches that are not sent yet"""
 
-    def add(self, payload: bytes, time_ns: int) -> bool:
-        """Adds a copy of a message, sent at `time_ns` of run time; returns True if this completes a batch."""
-        if not self._payloads:
-            self._first_ns = time_ns
+    def add(self, payload: bytes) -> bool:
+        """Adds a copy of a message; returns True if this completes a batch."""
         self._payloads.append(payload)
         self._size += len(payload)
-        return (self._size >= self._limit or time_ns - self._first_ns >= self._span_ns) and self.close()
+        return self._size >= self._limit and self.close()
 
     def close(self) -> bool:
         """Completes the batch in progress; returns False if it is empty."""
@@ -79,8 +75,8 @@ class CopyBatcher:
 class Runner(ABC):
     """One role of a plan, connected to a session.  The constructor declares all that the role sends and receives.
 
-    `watched` sends copies of its messages to observers, in batches of about `batch_bytes` that span `batch_ns` at most.  With
-    `every_ns` only the first message of each channel in every such time is copied, and the others are counted as thinned.
+    `watched` sends copies of its messages to observers, in batches of at most about `batch_bytes`.  With `every_ns` only the
+    first message of each channel in every such time is copied, and the others are counted as thinned.
     `frames` are the bounds of frames that it receives."""
 
     def __init__(
@@ -93,7 +89,6 @@ class Runner(ABC):
         *,
         watched: bool,
         batch_bytes: int,
-        batch_ns: int,
         virtual: bool,
         frames: Fits | None = None,
         every_ns: int = 0,
@@ -108,7 +103,7 @@ class Runner(ABC):
         self._copies: CopyBatcher | None = None
         if watched:
             publisher = session.publisher(watch_key(run, member.role, member.name))
-            self._copies = CopyBatcher(publisher, batch_bytes, batch_ns)
+            self._copies = CopyBatcher(publisher, batch_bytes)
         self._every_ns = every_ns
         self._copied: dict[Channel, int] = {}
         """The number of the time `every_ns` in which a message of a channel was last copied"""
@@ -190,7 +185,7 @@ class Runner(ABC):
                 self.counts.thinned += 1
                 return False
             self._copied[message.channel] = number
-        return self._copies.add(payload, message.time_ns)
+        return self._copies.add(payload)
 
     def stop(self) -> None:
         """Ends the run early, for a signal handler in the main thread: raises SystemExit there, at once if it waits, otherwise

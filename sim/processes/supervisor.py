@@ -61,11 +61,11 @@ class Supervisor:
     `run` is a name that no other run has: it is part of the keys of all messages.  `virtual`: in virtual time, else on a wall
     clock.  `can_urls` has a URL for each bus; without it there are no frames.  `scenario_toml`, `metadata` and `part_files`
     (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
-    five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up.  With `keep_going` the run
-    does not stop when a robot's state is not finite.  With `observe` it is open to observers, who get the `ticket`.
-    `interrupted` notes the signals that ask the run to end; without it the supervisor notes them itself.  On a wall clock
-    only the messages of one instant in every `every_ns` are recorded, if it is given (`sim.wall_load`).  `order` may change the
-    order in which processes start."""
+    five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up; one that is not recorded
+    shows no progress, and must be over by then.  With `keep_going` the run does not stop when a robot's state is not finite.
+    With `observe` it is open to observers, who get the `ticket`.  `interrupted` notes the signals that ask the run to end;
+    without it the supervisor notes them itself.  On a wall clock only the messages of one instant in every `every_ns` are
+    recorded, if it is given (`sim.wall_load`).  `order` may change the order in which processes start."""
 
     def __init__(
         self,

@@ -16,7 +16,6 @@ import numpy as np
 
 from echelon.bridge.frame_message import FrameBounds, unpack
 from echelon.messages import Channel, Message
-from echelon.plan.can_plan import NEVER_NS
 from echelon.plan.plan import Plan
 from echelon.runtime.admission import ALWAYS, BEGIN, EARLY_NS, Admission, Refusals, why, within
 from echelon.runtime.admission_rules import admissions_of
@@ -203,12 +202,14 @@ class RunRecorder:
         recorder, trace = self.recorder, self._trace
         if self.lost is None and not self._keep_going:
             self.lost = _first_lost(messages)
-        last_ns = self.lost.time_ns if self.lost is not None else NEVER_NS
+        if self.lost is not None:
+            last_ns = self.lost.time_ns
+            messages = [message for message in messages if message.time_ns <= last_ns]
+        if not messages:
+            return
+        self.messages += len(messages)
+        self._time_ns = max(self._time_ns, messages[-1].time_ns)
         for message in messages:
-            if message.time_ns > last_ns:
-                return
-            self.messages += 1
-            self._time_ns = max(self._time_ns, message.time_ns)
             if message.channel is Channel.FRAMES:
                 if message.source == self._bridge:  # its messages contain the drives' frames, too
                     for timed in unpack(message.values):

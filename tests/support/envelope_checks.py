@@ -125,6 +125,12 @@ def check_window_limit(module: ModuleType) -> None:
             assert sent(gate, 0, sign * 1.0) == ""
             assert sent(gate, 1, sign * 1.0) == ""
             assert sent(gate, at, sign * 3.0) == ("" if at == WINDOW + 2 else Rejection.WINDOW)
+    # torques within their own limit may be too far apart until the window is twice as wide
+    for window in (1.5, math.nextafter(2.0, 0.0)):
+        plan = replace(FREE, torque_limit=1.0, window_limit=window)
+        assert last(module, plan, [-1.0, 0.5]) == ""
+        assert last(module, plan, [-1.0, 1.0]) == Rejection.WINDOW
+    assert last(module, replace(FREE, torque_limit=1.0, window_limit=2.0), [-1.0, 1.0]) == ""
     assert last(module, replace(FREE, window_limit=0.0), [0.0, 0.0]) == ""
     assert last(module, replace(FREE, window_limit=0.0), [0.0, 5e-324]) == Rejection.WINDOW
 

@@ -63,7 +63,7 @@ def left_out(path: Path) -> Counter[str]:
 )
 def test_each_form_of_candump_is_read(line: str, time_ns: int) -> None:
     expected = Logged(time_ns, "can0", Frame(0x101, bytes.fromhex("E80324FA010700F3"), False))
-    assert read_line(line + "\n") == expected
+    assert read_line(f"{line}\n".encode()) == expected
 
 
 @pytest.mark.parametrize(
@@ -85,14 +85,14 @@ def test_each_form_of_candump_is_read(line: str, time_ns: int) -> None:
     ],
 )
 def test_what_is_no_classic_frame_is_told_apart(line: str, reason: str) -> None:
-    assert read_line(line) == LeftOut(reason, reason in (NOT_READ, WITHOUT_TIME))
+    assert read_line(line.encode()) == LeftOut(reason, reason in (NOT_READ, WITHOUT_TIME))
 
 
 def test_remote_frames_and_blank_lines() -> None:
     remote = Frame(0x101, b"", True)
     for line in ("(1.0) can0 101#R", "(1.0) can0 101#R8", " (1.0)  can0  101   [8]  remote request"):
-        assert read_line(line) == Logged(10**9, "can0", remote)
-    assert read_line("  \n") is None
+        assert read_line(line.encode()) == Logged(10**9, "can0", remote)
+    assert read_line(b"  \n") is None
 
 
 @pytest.mark.parametrize("packed", [False, True])

@@ -35,14 +35,19 @@ CALLS = {"min": "max", "max": "min", "popleft": "pop", "pop": "popleft"}
 
 # Equivalent mutants, as (line, line of the mutant).  Of two equal values the window may keep both or only the later one: if it
 # keeps both, the earlier one leaves first, and the later one has the same value.  A torque of zero has no common part with any
-# other torque, whichever sign it counts for.  Without limits the shortcut only saves time: no comparison with an infinite limit
-# finds anything.
+# other torque, whichever sign it counts for.  The shortcuts only save time: no comparison with an infinite limit finds
+# anything, and torques within their limit are never more than twice the limit apart.
 COMMON = "common = min(size, before) if (torque {} 0.0) is (sent {} 0.0) else 0.0"
+WINDOWED = "self._windowed = plan.window_limit {} * plan.torque_limit"
+SPREAD = "_largest(self.highs, now_ns, torque) + _largest(self.lows, now_ns, -torque) > plan.window_limit"
 EQUIVALENT = {
     ("while window and window[-1][1] <= value:", "while window and window[-1][1] < value:"),
     (COMMON.format(">", ">"), COMMON.format(">=", ">")),
     (COMMON.format(">", ">"), COMMON.format(">", ">=")),
     ("if self._unlimited:", "pass"),
+    (WINDOWED.format("< 2"), WINDOWED.format("<= 2")),
+    (WINDOWED.format("< 2"), WINDOWED.format("< 3")),
+    (f"if self._windowed and {SPREAD}:", f"if {SPREAD}:"),
 }
 
 

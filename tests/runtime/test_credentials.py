@@ -8,6 +8,7 @@ import pytest
 
 from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import Session, loopback_endpoints
+from support.plain_zenoh import plain_session
 from support.runs import until
 
 HOST = new_identity("leader/g1", ("run/g1", "run/@alive/g1"))
@@ -63,6 +64,34 @@ def test_those_who_know_each_other_hear_what_each_may_say_and_nothing_else(stack
     assert until(lambda: b"the guest's own" in by_host and b"the host's own" in by_guest)
     assert b"forged by the guest" not in by_host
     assert b"forged by the host" not in by_guest
+
+
+@pytest.mark.parametrize("keys", [(), ("run/g1/r1/state",)])
+def test_a_guest_says_its_own_keys_alone_whatever_it_does_with_its_secret(
+    stack: ExitStack, endpoint: str, keys: tuple[str, ...]
+) -> None:
+    """Also one that may only read.  Its session is Zenoh's own, so that nothing holds it back but the host."""
+    reader = new_identity("observer", keys)
+    host = opened(stack, endpoint, HOST, guests=(reader, GUEST))
+    guest = opened(stack, endpoint, GUEST, hosts=(HOST,))
+    assert meet(host, guest, "run/@alive/g1", "run/@alive/r1")
+    by_host, by_reader = heard(host), list[bytes]()
+    plain = stack.enter_context(plain_session([endpoint], reader))
+    plain.declare_subscriber("run/**", lambda sample: by_reader.append(bytes(sample.payload)))
+
+    def reads() -> bool:
+        host.publisher("run/g1").put(b"for all")
+        return b"for all" in by_reader
+
+    assert until(reads)
+    for key in ("run/g1/r1/state", "run/g1/r2/state", "run/g1"):
+        plain.put(key, key)
+    plain.put("run/g1/r1/state", "last")
+    guest.publisher("run/g1/r1/state").put(b"true")
+    assert until(lambda: b"true" in by_host and (not keys or b"last" in by_host))
+    assert [one for one in by_host if one not in (b"true", b"for all")] == (
+        [b"run/g1/r1/state", b"last"] if keys else []
+    )
 
 
 @pytest.mark.parametrize("who", ["without a secret", "with a wrong password", "unknown", "with a stolen name"])

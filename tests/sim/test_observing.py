@@ -14,11 +14,12 @@ import pytest
 from echelon.errors import UsageError
 from echelon.messages import Channel, Message
 from echelon.runtime.admission import Refusals
-from echelon.runtime.credentials import Credentials, Identity, new_identity
-from echelon.runtime.session import Session
-from echelon.runtime.wire import data_key, encode, join, run_keys, watch_key
+from echelon.runtime.credentials import Identity, new_identity
+from echelon.runtime.wire import data_key, encode, join, watch_key
 from echelon.sim.observing import TICKET, Ticket, new_gate, observe
+from echelon.sim.processes.outcome import Progress
 from echelon.sim.processes.supervisor import Supervisor
+from support.plain_zenoh import plain_session
 from support.runs import echelon, plan_of, start_echelon, summary_of, trace_of, until
 
 QUICK = ("--can", "none", "--no-report", "--quiet")
@@ -88,37 +89,36 @@ def test_a_ticket_with_values_of_other_types_is_one_line(name: str, tmp_path: Pa
 
 
 def test_a_ticket_is_of_no_use_for_writing(tmp_path: Path) -> None:
-    """Neither at the process `observers` nor at any other."""
+    """Neither at the process `observers` nor at any other.  The session is Zenoh's own, so that nothing in it holds back what
+    it says."""
     plan = plan_of("lab", "duration=5.0")
     supervisor = Supervisor(plan, tmp_path, run=f"observed-{os.getpid()}", virtual=True, observe=True)
     ticket = supervisor.ticket
     assert ticket is not None
-    endpoints = [endpoint for spec in supervisor._specs for endpoint in spec.listen]
+    endpoints = [ticket.endpoint, *(endpoint for spec in supervisor._specs for endpoint in spec.listen)]
     guest = Identity(ticket.user, new_identity("x", ()).zenoh_id, ticket.password, ())
     robot, run = plan.robots[0], ticket.run
-    with Session(
-        listen=[],
-        connect=[ticket.endpoint, *endpoints],
-        lockstep=False,
-        credentials=Credentials(guest, run_keys(run)),
-    ) as session:
-        forged = Message(Channel.STATE, robot.index, 3, 3 * robot.period_ns, np.full(16, 3.0))
-        puts = (
-            session.publisher(data_key(run, robot.path, Channel.STATE)),
-            session.publisher(watch_key(run, "robot", robot.name)),
-        )
+    heard: set[str] = set()
+    with plain_session(endpoints, guest) as session:
+        session.declare_subscriber(f"echelon/{run}/**", lambda sample: heard.add(str(sample.key_expr)))
         said = 0
 
-        def say(*_: object) -> None:
+        def say(progress: Progress) -> None:
+            """Forges the robot's next states, just ahead of the run."""
             nonlocal said
-            puts[0].put(encode(forged))
-            puts[1].put(join([encode(forged)]))
+            now = progress.time_ns // robot.period_ns
+            for number in range(now, now + 30):
+                forged = Message(Channel.STATE, robot.index, number, number * robot.period_ns, np.full(16, 3.0))
+                session.put(data_key(run, robot.path, Channel.STATE), encode(forged))
+                session.put(watch_key(run, "robot", robot.name), join([encode(forged)]))
             said += 1
 
         supervisor._show = say
         outcome = supervisor.run()
     assert said > 3
+    assert data_key(run, robot.path, Channel.STATE) in heard  # it was let in
     assert outcome.failure is None
+    assert outcome.refusals() == ()
     assert outcome.trace.digest() == trace_of(plan).digest()
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from chaos.frames import COMMAND_ID, ENABLE, FEEDBACK_ID, is_whole, torque_frame
+from echelon.bridge.protocols.cyclic import WheelState
 from support.namespaces import HERE, THERE, Hosts, NamespaceError, two_hosts
 from support.notice import say_not_tested
 from support.runs import ROOT
@@ -116,17 +118,18 @@ FORGE = """
 import sys, can
 from can.interfaces.udp_multicast.utils import pack_message
 import socket, time
+import json
 group, port, here = sys.argv[1], int(sys.argv[2]), sys.argv[3]
-torque = bytes.fromhex(sys.argv[4])
+frames = [(can_id, bytes.fromhex(data)) for can_id, data in json.loads(sys.argv[4])]
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plain:
     plain.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 4)
     print("forging", flush=True)
     while True:
-        for can_id in (0x100, 0x200):
-            data = pack_message(can.Message(arbitration_id=can_id, data=torque, is_extended_id=False))
+        for can_id, data in frames:
+            datagram = pack_message(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
             for address in (group, here):
-                plain.sendto(data, (address, port))
-        time.sleep(0.002)
+                plain.sendto(datagram, (address, port))
+            time.sleep(0.001)
 """
 
 
@@ -135,12 +138,20 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plain:
 def test_forged_torque_and_feedback_move_no_wheel_and_fail_the_verdict(
     hosts: Hosts, tmp_path: Path, clock: str
 ) -> None:
-    forged = "7F7F7F7F030000AA"
+    # commands of the host, and feedback of the drive, that their receivers would take: with counters that go on
+    forged = [
+        (can_id, torque_frame(can_id, 8000, -8000, byte_4, counter))
+        for counter in range(16)
+        for can_id, byte_4 in ((COMMAND_ID, ENABLE), (FEEDBACK_ID, WheelState.ENABLED * 0x11))
+    ]
+    assert all(is_whole(can_id, data) for can_id, data in forged)
     scenario = tmp_path / "two.toml"
     scenario.write_text(two_robots(watchdog=2.0))
     run = ["run", str(scenario), "--clock", clock, "--set", "can.path=closed", "--set", "duration=1.5"]
     run += ["--can", f"udp_multicast:239.74.163.2:{PORT}", "--quiet", "--no-report"]
-    attacker = start(hosts.there, FORGE, "239.74.163.2", PORT, HERE, forged)
+    attacker = start(
+        hosts.there, FORGE, "239.74.163.2", PORT, HERE, json.dumps([(can_id, data.hex()) for can_id, data in forged])
+    )
     try:
         assert attacker.stdout is not None
         assert attacker.stdout.readline() == "forging\n"
@@ -153,10 +164,11 @@ def test_forged_torque_and_feedback_move_no_wheel_and_fail_the_verdict(
         attacker.communicate()
     assert done.returncode == 1, done.stderr
     assert f"came from elsewhere: {THERE} sent 100 on can0, " in done.stdout
-    assert forged not in (tmp_path / "run" / "can.log").read_text()
+    log = (tmp_path / "run" / "can.log").read_text()
+    assert not any(f"{can_id:03X}#{data.hex().upper()}" in log for can_id, data in forged)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     found: dict[str, Any] = {row["id"]: row for row in summary["can"]["intrusions"]}
-    assert set(found) == {"100", "200"}
+    assert set(found) == {"100", "180"}
     assert all(row["sender"] == THERE and row["frames"] > 50 for row in found.values())
     assert summary["can"]["foreign"] == summary["can"]["drives"]["foreign"] == 0
     assert not any(row["refused"] for row in summary["can"]["drives"]["robots"].values())

@@ -31,7 +31,7 @@ from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
-from echelon.sim.parts.foreign_parts import stalled_in, unstalled
+from echelon.sim.parts.foreign_parts import patience_with_bridge, stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
 from echelon.sim.processes.outcome import Outcome, Progress
 from echelon.sim.processes.supervisor import Supervisor
@@ -47,6 +47,8 @@ from echelon.sim.wall_load import wall_load
 
 PACKAGES: Final = ("eclipse-zenoh", "numpy", "python-can", "mcap")
 """Packages whose versions are noted in the recording"""
+STOP_S: Final = 5.0
+"""How long a bridge in one process may take to stop the wheels, if drives speak a user's own protocol [s]"""
 
 
 def execute(
@@ -179,7 +181,9 @@ def _in_process(
         batch = gathered.copy()
         gathered.clear()  # before anything can raise, so that nothing is passed on twice
         recording.add(order.push(batch))
-        recording.add(order.push(bridge.take(batch)))
+        with patience_with_bridge(plan, stall_timeout_s):
+            frames = bridge.take(batch)
+        recording.add(order.push(frames))
 
     time_ns = 0
     error: BaseException | None = None
@@ -221,14 +225,17 @@ def _in_process(
     # From here on signals raise nothing, as before the loop.
     try:
         pass_on()
-    except (SystemExit, PartRunError):
+    except (SystemExit, PartRunError, TookTooLong):
         pass
     except BaseException as other:
         error = error or other
     try:
-        bridge.stop()
+        with patience_with_bridge(plan, STOP_S):
+            bridge.stop()
     except PartRunError as why:
         failure = failure or str(why)
+    except TookTooLong as why:
+        failure = failure or f"{stalled_in(plan, why)} takes longer than {STOP_S:g} s to stop the wheels"
     if error is not None:
         bridge.close()
         raise error

@@ -4,6 +4,7 @@ It makes every object that a run will need.  An error raises PartRunError: one l
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any, Final
 
 from echelon.bridge.protocols.checked import Caller
@@ -27,15 +28,17 @@ _TRIED_FLOAT: Final = 0.001
 """What stands for a bit there if torques are floating point [N m]"""
 
 
-def try_protocols(plan: Plan) -> None:
+def try_protocols(plan: Plan, patience: Callable[[str], AbstractContextManager[None]]) -> None:
     """Makes host, drives, observer, master and DBC messages of one robot for each user's own protocol.
 
-    Raises PartRunError for the first error."""
+    `patience(who)` is a context that limits the time in which `who` is tried.  Raises PartRunError for the first error."""
     others = {id(robot.drive.protocol): robot for robot in reversed(plan.robots) if not robot.drive.protocol.is_own}
     for robot in others.values():
-        _try_robot(plan, robot)
+        with patience(f"{robot.drive.protocol.use} of {robot.name}"):
+            _try_robot(plan, robot)
     if others:
-        make_masters(plan)
+        with patience(" and ".join(dict.fromkeys(robot.drive.protocol.use for robot in others.values()))):
+            make_masters(plan)
 
 
 def _try_robot(plan: Plan, robot: RobotPlan) -> None:

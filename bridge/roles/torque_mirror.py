@@ -14,7 +14,6 @@ from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.envelope import Envelope
 from echelon.bridge.timing.bus_load import BitCount
-from echelon.errors import PartRunError
 from echelon.plan.can_plan import EnvelopePlan
 
 
@@ -115,9 +114,9 @@ class TorqueMirror:
             self._envelopes[robot].stop(counts.last_ns)
         return self._send(robot, self._hosts[robot].mirror(0.0, 0.0, False))
 
-    def end(self) -> tuple[list[tuple[int, Frame]], PartRunError | None]:
-        """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot, and the
-        failure of a host, if one has failed: the other robots are stopped all the same.
+    def end(self) -> tuple[list[tuple[int, Frame]], BaseException | None]:
+        """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot, and what a
+        host raised, if one has failed: the other robots are stopped all the same.
 
         The frames are not counted, since no state has caused them."""
         frames, failure = list[tuple[int, Frame]](), None
@@ -125,7 +124,7 @@ class TorqueMirror:
             if counts.frames:
                 try:
                     frames += [(robot, frame) for frame in self._hosts[robot].mirror(0.0, 0.0, False)]
-                except PartRunError as error:
+                except BaseException as error:  # also of a time limit, for a host that hangs
                     failure = failure or error
         return frames, failure
 

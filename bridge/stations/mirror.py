@@ -108,7 +108,7 @@ class MirrorBridge(Bridge):
     def stop(self) -> None:
         """Takes the torque away from the wheels and disables their drives: drives on the bus obey mirrored frames, too.
 
-        After that nothing is sent any more.  Raises PartRunError if a host failed, after all others are stopped."""
+        After that nothing is sent any more.  If a host raised something, raises it after all others are stopped."""
         self._stopped = True
         now_ns = None if self.clock is None else self.clock.now()
         stops, failure = self._mirror.end()

@@ -5,23 +5,28 @@ supervisor finds a silent process; in one process the time of an instant is limi
 """
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from traceback import walk_tb
 
 from echelon.agents.robot import Robot
+from echelon.bridge.roles.commander import Commander
+from echelon.bridge.roles.drive_bank import DriveBank
 from echelon.controller.node import TreeNode
 from echelon.plan.plan import NodePlan, Plan, RobotPlan
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
 
 
 def parts_of(plan: Plan, index: int) -> tuple[str, ...]:
-    """Returns the users' parts that a role runs, as the scenario names them."""
-    one = plan.all_roles[index]
-    parts = []
+    """Returns the users' parts that a role runs, as the scenario names them.  Bridge, drives and referee, which may be no roles
+    of the plan, run the protocols of all drives."""
+    one = plan.all_roles[index] if 0 <= index < len(plan.formation) else None
     if isinstance(one, RobotPlan):
         parts = [one.model]
     elif isinstance(one, NodePlan):
         parts = [plan.law] if one.parent is not None else [plan.law, plan.trajectory]
-    return tuple(part.use for part in parts if not part.is_own)
+    else:
+        parts = [robot.drive.protocol for robot in plan.robots]
+    return tuple(dict.fromkeys(part.use for part in parts if not part.is_own))
 
 
 def runs_text(plan: Plan, index: int) -> str:
@@ -33,8 +38,8 @@ def runs_text(plan: Plan, index: int) -> str:
 def unstalled(plan: Plan, instants: Iterator[int], seconds: float) -> Iterator[int]:
     """Yields the instants of a run in one process.
 
-    If the plan has users' parts, raises TookTooLong when an instant takes longer than `seconds`."""
-    if not any(parts_of(plan, one.index) for one in plan.formation):
+    If its roles run users' parts, raises TookTooLong when an instant takes longer than `seconds`."""
+    if not any(parts_of(plan, one.index) for one in plan.all_roles):
         yield from instants
         return
     while True:
@@ -45,10 +50,16 @@ def unstalled(plan: Plan, instants: Iterator[int], seconds: float) -> Iterator[i
         yield time_ns
 
 
+def patience_with_bridge(plan: Plan, seconds: float) -> AbstractContextManager[object]:
+    """Returns a context that raises TookTooLong if what a bridge does in one process takes longer than `seconds`; without a
+    limit if no drive speaks a user's own protocol."""
+    return time_limit(seconds) if parts_of(plan, len(plan.formation)) else nullcontext()
+
+
 def stalled_in(plan: Plan, error: TookTooLong) -> str:
     """Returns in words which part was running when an instant took too long."""
     for frame, _ in walk_tb(error.__traceback__):
         role = frame.f_locals.get("self")
-        if isinstance(role, (Robot, TreeNode)):
+        if isinstance(role, (Robot, TreeNode, Commander, DriveBank)):
             return f"{plan.all_roles[role.index].name}{runs_text(plan, role.index)}"
-    return "a role that is not known"
+    return f"bridge{runs_text(plan, len(plan.formation))}"

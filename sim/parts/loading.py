@@ -22,7 +22,7 @@ from echelon.sim.parts.probe import probe
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
 
 LOAD_PATIENCE_S: Final = 20.0
-"""Time limit for reading a part's file or importing an installed part [s]"""
+"""Time limit for reading a part's file or importing an installed part, and for the trial of a protocol [s]"""
 
 
 class PatientRegistry(Registry):
@@ -48,6 +48,15 @@ def _patience(use: str) -> Iterator[None]:
             yield
     except TookTooLong:
         raise PartError(f"{use} takes longer than {LOAD_PATIENCE_S:g} s to load") from None
+
+
+@contextmanager
+def _trial(who: str) -> Iterator[None]:
+    try:
+        with time_limit(LOAD_PATIENCE_S):
+            yield
+    except TookTooLong:
+        raise PartRunError(f"{who} takes longer than {LOAD_PATIENCE_S:g} s to be tried") from None
 
 
 REGISTRY: Final = PatientRegistry(
@@ -82,7 +91,7 @@ def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:
     """Returns scenario and plan after a trial of the users' parts."""
     try:
         probe(plan)
-        try_protocols(plan)
+        try_protocols(plan, _trial)
     except PartRunError as error:
         raise ScenarioError(f"{name}: {error}") from error.__cause__  # what the part raised, for --debug
     return scenario, plan

@@ -41,7 +41,7 @@ ENVIRONMENT: Final = {"PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
 """Environment variables of the processes.  The matrices of a formation are small, so threads of numpy would only cost time."""
 LAST_WORDS: Final = 4000
 """How many bytes of a process's standard error are kept."""
-ROLES: Final = ("robot", "leader", "coordinator")
+ROLES: Final = ("robot", "leader", "coordinator", "bridge", "drives", "referee")
 """Kinds of processes that may run parts written by users"""
 
 
@@ -63,6 +63,8 @@ class Child:
     done: Done | None = None
     waiting_for: list[int] = field(default_factory=list)
     waiting_ns: int = -1
+    waiting_s: float = 0.0
+    """When it last said that it waits"""
     said: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
     ours: set[int] = field(default_factory=set)
     """The numbers of the signals that the supervisor has sent to it"""

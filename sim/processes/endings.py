@@ -128,7 +128,7 @@ def _finish(
             elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
                 break
             if not failure and waited_s > STALL_REPORT_S:
-                say(f"waits for {child.name} to finish ({child.state()})")
+                say(f"waits for {child.name} to finish ({child.state()}{child.runs()})")
     except (RunError, DivergedError, OSError) as error:
         failure = failure or str(error)
     return failure or (_lost(child) if child.done is None else None)
@@ -136,7 +136,7 @@ def _finish(
 
 def _lost(child: Child) -> str:
     """Returns in words that a process does not finish."""
-    still = f", {child.state()}" if child.alive else ""
+    still = f", {child.state()}{child.runs()}" if child.alive else ""
     return f"lost {child.spec.kind} ({child.ending()}{still}){last_words_of([child])}"
 
 

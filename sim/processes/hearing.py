@@ -76,7 +76,7 @@ class Hearing:
             case Ready():
                 child.ready = True
             case Waiting():
-                child.waiting_ns, child.waiting_for = said.time_ns, list(said.sources)
+                child.waiting_ns, child.waiting_for, child.waiting_s = said.time_ns, list(said.sources), child.heard_s
             case LinksProgress():
                 progress.hear_links(said.links)
             case BridgeProgress() if child.spec.kind == "bridge":

@@ -113,18 +113,23 @@ class StallWatch:
     def _stands_at_ns(self, now_s: float) -> int:
         """Returns the instant [ns] at which the run stands: the first one at which a member waits.  What is recorded may be
         older, for copies of messages come in batches."""
-        waits = [
-            child.waiting_ns for child in self._children if child.waiting_for and now_s - child.heard_s <= SILENT_S
-        ]
+        waits = [child.waiting_ns for child in self._children if _waits(child, now_s)]
         return max(self._progress.time_ns, min(waits, default=0))
 
     def _who_is_waited_for(self, now_s: float) -> str:
         """Returns in words which processes everyone waits for: the silent ones, or else who waits for whom.
 
-        A silent watcher comes first: members may be silent only because it does not take their messages."""
+        A silent watcher comes first: members may be silent only because it does not take their messages.  One that is waited
+        for, and waits for nobody, works or hangs, even if a thread of it still speaks."""
         quiet = [child for child in self._children if now_s - child.heard_s > SILENT_S]
         silent = [child for child in quiet if not child.is_member]
         silent = silent or [child for child in quiet if child.is_member and child.done is None]
+        awaited = {source for child in self._children if _waits(child, now_s) for source in child.waiting_for}
+        silent = silent or [
+            child
+            for child in self._children
+            if child.spec.index in awaited and child.is_member and child.done is None and not _waits(child, now_s)
+        ]
         if silent:
             return "everyone waits for " + few(
                 [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent]
@@ -136,3 +141,8 @@ class StallWatch:
             if child.waiting_for
         ]
         return "all wait: " + few(waits, "; ")
+
+
+def _waits(child: Child, now_s: float) -> bool:
+    """Returns whether a process has said lately that it waits."""
+    return bool(child.waiting_for) and now_s - child.waiting_s <= SILENT_S

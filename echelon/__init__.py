@@ -15,6 +15,7 @@ For notebooks and scripts:
     echelon.Simulation("lab")               a run step by step
     echelon.replay("runs/demo", {…})        its messages fed to roles with other values: where their outputs differ
     echelon.diff("runs/a", "runs/b")        where two runs part
+    echelon.analyse("lab").table            what each layer bears of delay and loss on each channel, without a run
     echelon.sweep("lab", vary={"law.lead": "0:1:0.1"}, seeds=20)    many runs, with values that vary
     echelon.open_sweep("runs/many")         a sweep from its folder
 
@@ -32,16 +33,18 @@ if TYPE_CHECKING:
     from echelon.controller.trajectory import Trajectory
     from echelon.errors import UserError
     from echelon.sim.finished_run import Run
-    from echelon.sim.notebook import Loaded, diff, load, open_run, open_sweep, replay, run, sweep
+    from echelon.sim.notebook import Loaded, analyse, diff, load, open_run, open_sweep, replay, run, sweep
     from echelon.sim.replay.comparison import ChannelComparison, Difference
     from echelon.sim.replay.difference import RunDifference
     from echelon.sim.replay.replay import Replay
+    from echelon.sim.results.analysis import AnalysisResult
     from echelon.sim.results.latencies import Latencies, LinkLatency
     from echelon.sim.simulation import Simulation
     from echelon.sim.sweep.study import Sweep
 
 __version__ = "0.1.0"
 __all__ = [
+    "AnalysisResult",
     "ChannelComparison",
     "Difference",
     "DriveProtocol",
@@ -58,6 +61,7 @@ __all__ = [
     "Trajectory",
     "UserError",
     "__version__",
+    "analyse",
     "diff",
     "load",
     "open_run",
@@ -72,15 +76,19 @@ def __getattr__(name: str) -> Any:
     """Imports a public name when it is first used: most processes and commands need only a few of them."""
     found: dict[str, Any] = {}
     match name:
-        case "Loaded" | "diff" | "load" | "open_run" | "open_sweep" | "replay" | "run" | "sweep":
-            from echelon.sim.notebook import Loaded, diff, load, open_run, open_sweep, replay, run, sweep
+        case "Loaded" | "analyse" | "diff" | "load" | "open_run" | "open_sweep" | "replay" | "run" | "sweep":
+            from echelon.sim.notebook import Loaded, analyse, diff, load, open_run, open_sweep, replay, run, sweep
 
             found = {"Loaded": Loaded, "diff": diff, "load": load, "open_run": open_run, "open_sweep": open_sweep}
-            found |= {"replay": replay, "run": run, "sweep": sweep}
+            found |= {"analyse": analyse, "replay": replay, "run": run, "sweep": sweep}
         case "Run":
             from echelon.sim.finished_run import Run
 
             found = {"Run": Run}
+        case "AnalysisResult":
+            from echelon.sim.results.analysis import AnalysisResult
+
+            found = {"AnalysisResult": AnalysisResult}
         case "ChannelComparison" | "Difference":
             from echelon.sim.replay.comparison import ChannelComparison, Difference
 

@@ -1,4 +1,4 @@
-"""Functions for notebooks and scripts: `load`, `run` and `open_run`, with the same names of options as the command line."""
+"""Functions for notebooks and scripts, such as `load`, `run` and `analyse`; their options are named as on the command line."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +22,7 @@ from echelon.sim.parts import loading as parts
 if TYPE_CHECKING:
     from echelon.sim.replay.difference import RunDifference
     from echelon.sim.replay.replay import Replay
+    from echelon.sim.results.analysis import AnalysisResult
     from echelon.sim.sweep.origin import Origin
     from echelon.sim.sweep.study import Sweep
 
@@ -180,6 +181,32 @@ def sweep(
     prepared = prepare(request)
     with SweepDisplay(prepared.notes, quiet=quiet) as display:
         return run_sweep(prepared, None if out is None else Path(out), workers, display.show)
+
+
+@_arguments_for_options()
+def analyse(
+    scenario: AnyScenario,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    members: bool = False,
+    policies: bool = False,
+    runs: int = 64,
+) -> "AnalysisResult":
+    """Computes without a run whether a formation settles, and what it tolerates: `analyse("lab").table`.
+
+    `scenario` and `changes` are those of `load`; the other options and the result are those of `echelon analyse`
+    (docs/analyse.md):
+
+    members   also what the links of each robot and each group tolerate
+    policies  also what each policy buys on each channel
+    runs      runs of the batch engine for each number that can only be estimated; 0: leave them out
+
+    Raises UserError for a wrong scenario or option, and for a scenario that cannot be analysed."""
+    from echelon.sim.forecast.analysing import analysis_of_scenario
+    from echelon.sim.forecast.motion import asked_of
+
+    found, plan = load(scenario, changes)
+    return analysis_of_scenario(found, plan, asked_of(plan), found.name, members=members, policies=policies, runs=runs)
 
 
 def open_sweep(folder: str | Path) -> "Sweep":

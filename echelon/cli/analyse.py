@@ -47,34 +47,29 @@ def analyse(options: AnalyseOptions) -> int:
     Returns exit code 1 if it does not settle, or if the torque loop of a robot diverges."""
     from echelon.cli.analyse_text import lines_of
     from echelon.cli.scenario_file import read_scenario
-    from echelon.controller.prediction.gains import PredictionError
-    from echelon.sim.forecast.analysing import analysis_of
+    from echelon.sim.forecast.analysing import analysis_of_scenario
     from echelon.sim.forecast.motion import asked_of, torque_loop_warnings
     from echelon.sim.results.rendering import json_text
 
     if options.format and options.figures is None:
         raise UsageError(f"--format {options.format[0]}: needs --figures DIR, which writes the figures as files")
-    if not 0 <= options.runs <= 100_000:
-        raise UsageError(f"--runs {options.runs}: must be from 0 to 100000")
     scenario, plan = read_scenario(options.scenario, options.overrides)
     asked = asked_of(plan)
-    law, progress = scenario.law, _Progress()
+    progress = _Progress()
     try:
-        found = analysis_of(
+        found = analysis_of_scenario(
+            scenario,
             plan,
-            law.time_scales,
-            law.epsilon,
             asked,
+            options.scenario,
             members=options.members,
             policies=options.policies,
             runs=options.runs,
             say=progress.say,
         )
-    except PredictionError as error:
-        raise UsageError(f"{options.scenario}: cannot be analysed; run it instead: {error}") from None
     finally:
         progress.end()
-    written = [] if options.figures is None else _save_figures(options, found, plan, law, progress)
+    written = [] if options.figures is None else _save_figures(options, found, plan, scenario.law, progress)
     if options.json:
         print(json_text(found))
     else:

@@ -20,8 +20,10 @@ from echelon.controller.prediction.time_scales import (
     largest_epsilon,
     with_epsilon,
 )
+from echelon.errors import UserError
 from echelon.plan.link_plan import LinkPlan
 from echelon.plan.plan import Plan
+from echelon.scenario.tables import Scenario
 from echelon.sim.forecast.estimating import RUNS, Estimates, is_random
 from echelon.sim.forecast.link_rows import LinkRows, Say, finite, links_result
 from echelon.sim.forecast.motion import Asked
@@ -42,8 +44,36 @@ from echelon.sim.results.links_analysis import (
     ScaledDelays,
 )
 
+MOST_RUNS: Final = 100_000
+"""Largest number of runs for an estimate"""
+
 Made = TypeVar("Made")
 Value = TypeVar("Value", float, str)
+
+
+def analysis_of_scenario(
+    scenario: Scenario,
+    plan: Plan,
+    asked: Asked,
+    name: str,
+    *,
+    members: bool = False,
+    policies: bool = False,
+    runs: int = RUNS,
+    say: Say = lambda what, done, of: None,
+) -> AnalysisResult:
+    """Returns all predictions about a scenario, which errors call `name`; the options are those of `analysis_of`.
+
+    Raises UserError if it cannot be analysed, or for a number of runs that is not allowed."""
+    if not 0 <= runs <= MOST_RUNS:
+        raise UserError(f"--runs {runs}: must be from 0 to {MOST_RUNS}")
+    law = scenario.law
+    try:
+        return analysis_of(
+            plan, law.time_scales, law.epsilon, asked, members=members, policies=policies, runs=runs, say=say
+        )
+    except PredictionError as error:
+        raise UserError(f"{name}: cannot be analysed; run it instead: {error}") from None
 
 
 def analysis_of(

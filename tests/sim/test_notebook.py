@@ -14,6 +14,7 @@ from nbclient import NotebookClient
 import echelon
 from echelon.messages import STATE_FIELDS
 from echelon.scenario.toml_text import toml_value
+from echelon.sim.results.rendering import json_text
 from support.runs import ROOT, SCENARIOS, plan_of, summary_of, trace_of
 from support.runs import echelon as command
 
@@ -320,3 +321,20 @@ def test_what_has_no_folder_was_not_recorded() -> None:
     simulation.run_until(0.05)
     with pytest.raises(echelon.UserError, match="this run has no folder, so its messages were not recorded"):
         echelon.replay(simulation.result())
+
+
+def test_an_analysis_is_that_of_the_command() -> None:
+    links = [{"channel": "state", "delay": 0.3}]
+    found = echelon.analyse("lab", {"links": links}, policies=True, runs=0)
+    done = command("analyse", "lab", "--set", f"links={toml_value(links)}", "--policies", "--runs", "0", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(json_text(found)) == json.loads(done.stdout)
+    assert found.settles
+    for changes, runs, why in (
+        ({"robot.mass": -1}, 0, "robot.mass"),
+        ({}, -1, r"^runs -1: must be from 0 to 100000$"),
+    ):
+        with pytest.raises(echelon.UserError, match=why):
+            echelon.analyse("lab", changes, runs=runs)
+    with pytest.raises(echelon.UserError, match=r"^sliding: cannot be analysed; run it instead: .*is not linear"):
+        echelon.analyse("sliding")

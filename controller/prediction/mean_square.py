@@ -25,8 +25,10 @@ from echelon.plan.delay_tables import Bursts
 from echelon.plan.link_plan import LinkPlan
 from echelon.plan.plan import Array, Plan
 
-TRIED: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
+TRIED: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
 """Losses that are tried one after the other; between the last stable one and the first that is not, a finer search follows"""
+NEARLY: Final = 0.999
+"""The last loss that is tried, as a share of the one that cannot be reached"""
 FINE: Final = 1e-5
 """How closely the boundary is found"""
 ALIKE: Final = 1e-9
@@ -66,7 +68,7 @@ def mean_square(
     if losses.gain(0.0) >= 1:
         return LossBoundary(None, "unstable", burst, at_own)
     low = 0.0
-    for high in (each for each in TRIED if each < losses.most):
+    for high in (*(each for each in TRIED if each < NEARLY * losses.most), NEARLY * losses.most):
         if losses.gain(high) >= 1:
             return LossBoundary(_edge(losses.gain, low, high), "unstable", burst, at_own)
         low = high
@@ -85,7 +87,7 @@ class Losses:
         self._others = np.array([link.loss for link in plan.links])
         self.own = float(self._others[self._varied].max(initial=0.0))
         """The largest loss of these links in the plan"""
-        self.most = 1.0 if burst is None else burst / (1 + burst)
+        self.most = 1.0 if burst is None else most_lost(burst)
         """The loss that they cannot reach"""
         lossy, chained = {*np.flatnonzero(self._others).tolist(), *self._varied}, list[int]()
         if burst is not None:
@@ -157,11 +159,22 @@ def check_together(plan: Plan, chained: Sequence[int]) -> None:
         )
 
 
-def gilbert(loss: float, burst: float) -> Array:
-    """Returns the chain (`Chances.chain`) of a link that loses all messages in bad times and none in good ones; `burst` is the
-    mean length of a bad time [messages], `loss` the share of messages that are lost, below burst/(1 + burst)."""
+def most_lost(burst: float) -> float:
+    """Returns the share of messages that is lost if a burst of this mean length [messages] follows each message that comes."""
+    return burst / (1 + burst)
+
+
+def bursts_of(loss: float, burst: float) -> Bursts:
+    """Returns the chain of a link that loses all messages in bad times and none in good ones (Gilbert).
+
+    `burst` is the mean length of a bad time [messages], `loss` the share of messages that are lost, up to `most_lost`."""
     to_good = 1 / burst
-    return _chain(Bursts(to_bad=to_good * loss / (1 - loss), to_good=to_good, loss_good=0.0, loss_bad=1.0))
+    return Bursts(to_bad=min(1.0, to_good * loss / (1 - loss)), to_good=to_good, loss_good=0.0, loss_bad=1.0)
+
+
+def gilbert(loss: float, burst: float) -> Array:
+    """Returns the chain (`Chances.chain`) of a link with `bursts_of` this loss and mean length."""
+    return _chain(bursts_of(loss, burst))
 
 
 def of_bursts(link: LinkPlan) -> Array:

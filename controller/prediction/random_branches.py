@@ -4,7 +4,7 @@
     step      x⁺                                                   X⁺
     --------  ---------------------------------------------------  -------------------------------------------------
     Window    if all of its messages come, `early`, else `late`    late(all) - late(came) + early(came)
-    Either    if its message comes, `comes`, else `lost`           (1 - p) comes(X) + p lost(X)
+    Either    if its message comes, `comes`, else `lost`           (1 - p) comes(X) + p lost(X); of a chain for each mode
 
 Each is a step, too (`random_steps.Step`).
 """
@@ -66,7 +66,8 @@ class Window:
 class Either:
     """A message of a link that decides about more than its value: if it comes, `comes` follows, else `lost`."""
 
-    kind: int
+    kind: int | None
+    """The kind of link, which loses each message by itself; None: the Markov chain says, with outcome 0 the message comes"""
     comes: tuple[Step, ...]
     lost: tuple[Step, ...]
 
@@ -83,16 +84,24 @@ class Either:
         return [Either(self.kind, forced(self.comes, before, live), forced(self.lost, before, live))], before
 
     def moment(self, X: Array, chances: Chances) -> Array:
+        if self.kind is None:
+            return moment(self.comes, chances.after(0, X), chances) + moment(self.lost, chances.after(-1, X), chances)
         p = chances.losses[self.kind]
         comes = 0.0 if p == 1 else (1 - p) * moment(self.comes, X, chances)
         return np.asarray(comes if p == 0 else comes + p * moment(self.lost, X, chances))
 
     def mean(self, x: Array, chances: Chances) -> Array:
+        if self.kind is None:
+            return mean(self.comes, chances.after(0, x), chances) + mean(self.lost, chances.after(-1, x), chances)
         p = chances.losses[self.kind]
         return np.asarray((1 - p) * mean(self.comes, x, chances) + p * mean(self.lost, x, chances))
 
     def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
-        comes = random.random(x.shape[1]) >= chances.losses[self.kind]
+        if self.kind is None:
+            outcome, modes = chances.draw(modes, random)
+            comes = outcome == 0
+        else:
+            comes = random.random(x.shape[1]) >= chances.losses[self.kind]
         with_it, _, _ = sample(self.comes, x, modes, chances, random)
         without, _, _ = sample(self.lost, x, modes, chances, random)
         return np.where(comes, with_it, without), modes, comes

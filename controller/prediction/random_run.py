@@ -94,7 +94,7 @@ class RandomRun:
             )
             for only in (False, True)
         )
-        fall = _Fall(self.registers, self._lossy, T_ns - wait_ns)
+        fall = _Fall(self.registers, self._lossy, self._chained, T_ns - wait_ns)
         first = (self.registers.move(range(len(plan.robots)), wait_ns),) if wait_ns else ()
         early, late = ((*first, *make(plan.root)) for make in (fall.early, fall.late))
         if all(isinstance(step, Linear) for step in up):
@@ -106,9 +106,10 @@ class RandomRun:
 class _Fall:
     """The way down in a period of event-driven nodes."""
 
-    def __init__(self, registers: Registers, lossy: frozenset[int], rest_ns: int) -> None:
-        """`rest_ns` is how much of the period is left when all states are there."""
-        self._registers, self._plan, self._lossy, self._rest_ns = registers, registers.plan, lossy, rest_ns
+    def __init__(self, registers: Registers, lossy: frozenset[int], chained: frozenset[int], rest_ns: int) -> None:
+        """`lossy` and `chained` are those of the run, `rest_ns` is how much of the period is left when all states are there."""
+        self._registers, self._plan, self._rest_ns = registers, registers.plan, rest_ns
+        self._random, self._chained = lossy | chained, chained
         self._steer: dict[int, tuple[Role, LinearStage]] = {
             stage.timed.member: (role, stage) for role, stage in registers.stages() if stage.timed.turn is Turn.STEER
         }
@@ -125,8 +126,9 @@ class _Fall:
                 *(step for child in together for step in self.early(child)),
             ]
             at = self._registers.link(together[0].index, Input(node.index, Channel.REFERENCE))
-            if at in self._lossy:
-                steps.append(Either(at, tuple(comes), tuple(step for child in together for step in self.late(child))))
+            if at in self._random:
+                kind = None if at in self._chained else at
+                steps.append(Either(kind, tuple(comes), tuple(step for child in together for step in self.late(child))))
             else:
                 steps += comes
         return steps
@@ -162,7 +164,7 @@ class _Fall:
         found: dict[int, list[NodePlan]] = {}
         for child in nodes:
             at = self._registers.link(child.index, Input(node.index, Channel.REFERENCE))
-            shared = at in self._lossy and self._plan.links[at].loss_of_message
+            shared = at in self._random and self._plan.links[at].loss_of_message
             found.setdefault(-1 if shared else child.index, []).append(child)
         return list(found.values())
 

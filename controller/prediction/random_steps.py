@@ -54,6 +54,18 @@ class Chances:
         """Number of modes of the chain."""
         return int(self.chain.shape[1])
 
+    def after(self, outcome: int, X: Array) -> Array:
+        """Returns moments, or means, by the mode after a step of the chain, as far as it has an outcome; `X` is by the mode
+        before."""
+        return np.asarray(np.einsum("ij,iab->jab", self.chain[outcome], X))
+
+    def draw(self, modes: Indices, random: Generator) -> tuple[Indices, Indices]:
+        """Draws a step of the chain for runs in some modes; returns their outcomes, and the modes that follow."""
+        count, outcomes = self.modes, len(self.chain)
+        edges = np.cumsum(self.chain.transpose(1, 0, 2).reshape(count, -1), axis=1)[modes]
+        drawn = np.minimum((random.random((len(modes), 1)) >= edges).sum(axis=1), outcomes * count - 1)
+        return drawn // count, drawn % count
+
     def without_loss(self) -> Self:
         """Returns the chances with which every message comes; the chain goes on as it does."""
         chain = np.zeros_like(self.chain)
@@ -228,32 +240,27 @@ class Jump:
         return [cut, prune(before, live)], before
 
     def moment(self, X: Array, chances: Chances) -> Array:
-        chain = chances.chain
-        found = np.zeros_like(X) if self.came else np.einsum("ij,iab->jab", chain[-1], X)
-        for source, step in zip(self.sources, chain[:-1], strict=True):
-            taken = np.einsum("ij,iab->jab", step, X)
+        found = np.zeros_like(X) if self.came else chances.after(-1, X)
+        for outcome, source in enumerate(self.sources):
+            taken = chances.after(outcome, X)
             taken[:, self.dest] = taken[:, source]
             taken[:, :, self.dest] = taken[:, :, source]
             found += taken
         return found
 
     def mean(self, x: Array, chances: Chances) -> Array:
-        chain = chances.chain
-        found = np.zeros_like(x) if self.came else np.einsum("ij,iab->jab", chain[-1], x)
-        for source, step in zip(self.sources, chain[:-1], strict=True):
-            taken = np.einsum("ij,iab->jab", step, x)
+        found = np.zeros_like(x) if self.came else chances.after(-1, x)
+        for outcome, source in enumerate(self.sources):
+            taken = chances.after(outcome, x)
             taken[:, self.dest] = taken[:, source]
             found += taken
         return found
 
     def sample(self, x: Array, modes: Indices, chances: Chances, random: Generator) -> tuple[Array, Indices, Bits]:
-        outcomes, count = len(self.sources) + 1, chances.modes
-        edges = np.cumsum(chances.chain.transpose(1, 0, 2).reshape(count, -1), axis=1)[modes]
-        drawn = np.minimum((random.random((len(modes), 1)) >= edges).sum(axis=1), outcomes * count - 1)
-        outcome, x = drawn // count, x.copy()
+        (outcome, after), x = chances.draw(modes, random), x.copy()
         for number, source in enumerate(self.sources):
             x[self.dest] = np.where(outcome == number, x[source], x[self.dest])
-        return x, drawn % count, outcome < outcomes - 1
+        return x, after, outcome < len(self.sources)
 
 
 def prune(before: Bits, after: Bits) -> Linear:

@@ -1,12 +1,13 @@
 """The text of `echelon analyse` about links: how much later their messages may come, and how many may be lost."""
 
+from collections.abc import Container
 from typing import TYPE_CHECKING
 
 from echelon.cli.formatting import bound, counted, number, table
 
 if TYPE_CHECKING:
     from echelon.sim.results.analysis import AnalysisResult
-    from echelon.sim.results.links_analysis import DelayResult, EstimateResult, LinksResult, LossResult
+    from echelon.sim.results.links_analysis import BurstsResult, DelayResult, EstimateResult, LinksResult, LossResult
 
 
 def links_lines(found: "AnalysisResult") -> list[str]:
@@ -49,7 +50,19 @@ def links_lines(found: "AnalysisResult") -> list[str]:
         lines.append(
             f"    estimated by {max(counts)} runs for each value: E|e|² shrinks up to it (surely up to, surely grows from)"
         )
-    return [*lines, *(f"  loss is not exact: {why}" for why in reasons)]
+    lines += [f"  loss is not exact: {why}" for why in reasons]
+    return [*lines, *(_bursts(one, one.bursts, reasons) for one in classes if one.bursts is not None)]
+
+
+def _bursts(one: "LinksResult", found: "BurstsResult", reasons: Container[str]) -> str:
+    """Returns the line about losses in bursts; `reasons` have been said."""
+    why = "as above" if found.loss.why in reasons else found.loss.why
+    head = f"  {_named(one)}: of messages that are lost in bursts of {found.length:g}"
+    if not found.loss.why:
+        return f"{head}, {loss_text(found.loss)} may be lost"
+    if found.by_runs is None:
+        return f"{head}: not computed: {why}"
+    return f"{head}, ~ {_estimated(found.by_runs, 1e2, '%')} may be lost; not exact: {why}"
 
 
 def scales_lines(found: "AnalysisResult") -> list[str]:

@@ -52,6 +52,18 @@ class EstimateResult:
 
 
 @dataclass(frozen=True, slots=True)
+class BurstsResult:
+    """How many messages may be lost if losses come in bursts as long as those in the scenario."""
+
+    length: float
+    """Mean length of a burst [messages]; within it all are lost, between bursts none"""
+    loss: LossResult
+    """The boundary in the mean square, computed"""
+    by_runs: EstimateResult | None
+    """The boundary by runs; None: `loss` is exact, or not computed"""
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyResult:
     """What the links of a channel bear with a policy, time-driven, without other losses and delays than the scenario has."""
 
@@ -96,6 +108,9 @@ class LinksResult:
     or not computed"""
     loss_by_runs: EstimateResult | None
     """How many of their messages may be lost, by runs; None: `loss` is exact, or not computed"""
+    bursts: BurstsResult | None = None
+    """How many of their messages may be lost in bursts; None: only for classes of which all links lose messages in bursts of
+    one length"""
 
 
 @dataclass(frozen=True, slots=True)

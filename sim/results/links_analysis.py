@@ -39,14 +39,16 @@ class LossResult:
 
 @dataclass(frozen=True, slots=True)
 class EstimateResult:
-    """A boundary that was searched for with random runs: a delay [s], or a share of lost messages."""
+    """A boundary that was searched for with random runs: a delay [s], or a share of lost messages.
+
+    Near the boundary of losses rare runs carry E|e|², and these runs may hold none of them: then links bear less."""
 
     value: float | None
     """The largest value tried up to which E|e|² shrinks; None: it grows even at the smallest one"""
     low: float | None
-    """Up to this value it shrinks for sure, by the 95 % intervals of all points tried; None: nowhere"""
+    """Up to this value it shrinks by the 95 % intervals of all points tried; None: nowhere"""
     high: float | None
-    """The smallest value at which it grows for sure; None: at none that was tried"""
+    """The smallest value at which it grows by the 95 % interval; None: at none that was tried"""
     runs: int
     """Runs for each value"""
 

@@ -23,9 +23,7 @@ def tree(timing: str, shape: tuple[object, ...] = ((None, None), (None,))) -> Pl
     periods = {"acceleration": 0.4, "torque": 0.1}
     still = {"kind": "line", "velocity": (0.0, 0.0)}
     random = np.random.default_rng(3)
-    return plan_of(
-        scenario(shape, random, law=law, periods=periods, timing=timing, trajectory=still, duration=2.0)
-    )
+    return plan_of(scenario(shape, random, law=law, periods=periods, timing=timing, trajectory=still, duration=2.0))
 
 
 def places(plan: Plan, channel: Channel) -> list[int]:
@@ -59,9 +57,7 @@ def test_bursts_without_memory_are_independent_losses(channel: Channel, timing: 
 @pytest.mark.parametrize("channel", [Channel.REFERENCE, Channel.COMMAND])
 def test_without_delays_both_timings_bear_the_same_bursts(channel: Channel) -> None:
     """Nodes wait for states that are lost, but not for what comes from above."""
-    radii = [
-        Losses(lossy(plan, places(plan, channel), 0.4, 3.0), (), None).radius(0.0) for plan in map(tree, TIMINGS)
-    ]
+    radii = [Losses(lossy(plan, places(plan, channel), 0.4, 3.0), (), None).radius(0.0) for plan in map(tree, TIMINGS)]
     assert radii[0] == pytest.approx(radii[1], rel=1e-6)
 
 

@@ -11,25 +11,11 @@ from pathlib import Path
 import pytest
 
 from echelon.sim.parts.loading import load
+from support.awkward import write_awkward_files
 from support.runs import ROOT, summary_of
 
 EXAMPLES = ROOT / "examples"
 COMMAND = Path(sys.executable).parent / "echelon"
-AWKWARD = (
-    "numpy",
-    "controller",
-    "types",
-    "echelon",
-    "agents",
-    "sim",
-    "signal",
-    "json",
-    "zenoh",
-    "can",
-    "site",
-    "my_laws-2",
-)
-"""Names of files that others have, too"""
 
 
 @pytest.fixture
@@ -37,8 +23,7 @@ def folder(tmp_path: Path) -> Path:
     """A copy of the examples, with files of awkward names beside them."""
     folder = tmp_path / "mine"
     shutil.copytree(EXAMPLES, folder)
-    for name in AWKWARD:
-        (folder / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
+    write_awkward_files(folder)
     return folder
 
 
@@ -136,11 +121,13 @@ plant_for_a_law = my_parts_my_plants:Slipping
 slipping = my_parts_my_plants:Slipping
 [echelon.trajectories]
 eight = my_parts_my_paths:Eight
+[echelon.protocols]
+my_protocol = my_parts_my_drive:MyProtocol
 """
 
 
 def test_installed_parts_are_used_by_name(tmp_path: Path) -> None:
-    distribution = wheel(tmp_path, ("my_laws", "my_plants", "my_paths"), ENTRY_POINTS)
+    distribution = wheel(tmp_path, ("my_laws", "my_plants", "my_paths", "my_drive"), ENTRY_POINTS)
     target = tmp_path / "installed"
     pip = [
         sys.executable,
@@ -173,6 +160,12 @@ def test_installed_parts_are_used_by_name(tmp_path: Path) -> None:
     parts = summary_of(folder / "many")["parts"]
     assert {part["use"] for part in parts} == {"sliding_mode", "slipping", "eight"}
     assert all(part["file"] is None for part in parts)
+    drives = ("can.path=closed", "robot.drive.protocol=my_protocol", "duration=0.5", "claims=[]")
+    sets = [argument for override in drives for argument in ("--set", override)]
+    run(folder, "closed", "--engine", "inprocess", *sets, env=env)
+    rows = summary_of(folder / "closed")["can"]["robots"].values()
+    assert {(row["protocol"], row["enabled"], row["fault"]) for row in rows} == {("my_protocol", True, "")}
+    assert all(row["largest"] > 0.01 for row in rows)
     for use, says in (
         ("sliding", "did you mean 'sliding_mode'?"),
         ("broken", "the installed my_parts_my_laws:Nothing cannot be loaded: AttributeError"),

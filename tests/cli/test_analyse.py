@@ -261,6 +261,16 @@ def test_without_runs_it_is_said_why_nothing_is_known() -> None:
     assert echelon("analyse", "-", "--runs", "-1", typed=FOUR).returncode == 2
 
 
+def test_a_law_that_is_not_linear_is_refused_in_a_line() -> None:
+    done = echelon("analyse", "sliding")
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line == (
+        "echelon: sliding: cannot be analysed; run it instead: law.use = 'terminal_sliding': is not linear, "
+        "and what is computed here holds for linear laws"
+    )
+
+
 def test_messages_older_than_their_timeout_are_named() -> None:
     done = echelon("analyse", "drives", "--set", 'links=[{channel="state", delay=0.15}]')
     assert done.returncode == 2

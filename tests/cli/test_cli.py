@@ -3,10 +3,13 @@
 import csv
 import json
 import os
+import platform
 import shlex
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
+from importlib.metadata import version
 from pathlib import Path
 
 import cantools
@@ -46,6 +49,16 @@ def test_a_run_leaves_its_folder(folder: Path) -> None:
     assert summary["trace_digest"] == trace_of(plan).digest() == read_trace(folder / "run.mcap", plan).digest()
     assert summary["verdict"]["word"] == "HEALTHY"
     assert summary["can"]["frames"] == 9 * 200
+    facts = summary["run"]
+    ago = datetime.now(UTC) - datetime.fromisoformat(facts["date"])
+    assert timedelta(0) <= ago < timedelta(hours=1)
+    assert facts["date"].endswith("+00:00")
+    assert (facts["version"], facts["python"]) == (version("echelon"), platform.python_version())
+    assert facts["machine"].startswith(f"{platform.platform()}, ")
+    assert facts["machine"].endswith(f", {os.cpu_count()} cores")
+    program, *words = shlex.split(facts["command"])
+    assert Path(program).parts[-2:] == ("echelon", "__main__.py")
+    assert words == ["run", "paper", *QUICK, "--engine", "inprocess", "--out", str(folder)]
     assert read_scenario(folder / "run.mcap") == (folder / "scenario.toml").read_text()
     assert read_metadata(folder / "run.mcap")["engine"] == "inprocess"
     assert len(read_links(folder / "run.mcap")) == 24

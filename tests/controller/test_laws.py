@@ -9,6 +9,7 @@ import pytest
 from echelon.agents.robot import Robot
 from echelon.controller.laws import Block, Law, Linear
 from echelon.controller.laws.central import CentralLaw
+from echelon.controller.laws.in_tree import NodeBlocks
 from echelon.controller.laws.law import law_block, make_nu, make_state, make_weight
 from echelon.errors import PartRunError
 from echelon.plan.plan import Plan
@@ -73,6 +74,13 @@ def test_the_linear_law_block_by_block_agrees_with_its_matrices(coupling, avoida
     expected, found = (Watched(one, 3).commanded(0) for one in (plan, of_another(plan, Same())))
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
     assert np.abs(expected).max() > 1
+
+
+@pytest.mark.parametrize(("name", "linear"), [("lab", True), ("paper", True), ("integral", False), ("sliding", False)])
+def test_nodes_multiply_out_the_linear_law_and_no_other(name: str, linear: bool) -> None:
+    plan = plan_of(name)
+    assert len(plan.nodes) > 1
+    assert [NodeBlocks.of(plan, node) is None for node in plan.nodes] == [linear] * len(plan.nodes)
 
 
 @pytest.mark.parametrize("tree", [PAPER_TREE, ((None,), (None, (None, None)), None)])

@@ -16,6 +16,7 @@ from echelon.planning.loading import ScenarioError
 from echelon.planning.loading import load as load_untried
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import REGISTRY, load
+from support.awkward import write_awkward_files
 from support.runs import EXAMPLES, echelon, reasons, summary_of
 
 TEXT = (EXAMPLES / "my_drive.py").read_text()
@@ -24,9 +25,10 @@ QUIET = ("--quiet", "--no-report")
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The user's folder."""
+    """The user's folder, with files of awkward names beside the protocol."""
     for path in EXAMPLES.glob("my_drive.*"):
         shutil.copy(path, tmp_path)
+    write_awkward_files(tmp_path)
     return tmp_path
 
 
@@ -71,7 +73,7 @@ def test_the_examples_run_in_one_process_and_in_many(protocol: str, folder: Path
         assert (row["protocol"], row["enabled"], row["fault"]) == (protocol, True, "")
         assert 0.01 < row["largest"] < 1.5
     # the run's folder contains the protocol, so the user's folder is not needed to look at the run
-    shown = echelon("can", tmp_path / "inprocess", cwd=tmp_path)
+    shown = echelon("can", tmp_path / "inprocess")
     assert shown.returncode == 0, shown.stderr
     assert "r3" in shown.stdout
 

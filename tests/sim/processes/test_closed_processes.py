@@ -155,9 +155,10 @@ def wall_run(tmp_path: Path) -> Iterator[tuple[Popen[str], Listener, Path]]:
         command = start_echelon("run", "lab", *arguments, "--out", folder)
         try:
             listener = Listener(bus)
-            limit_ns = time.monotonic_ns() + 30_000_000_000
+            limit_ns = time.monotonic_ns() + 600_000_000_000
             while not all(listener.moving_ns):
-                assert time.monotonic_ns() < limit_ns, command.poll()
+                assert command.poll() is None, command.communicate()
+                assert time.monotonic_ns() < limit_ns, listener.moving
                 listener.listen(time.monotonic_ns() + 100_000_000)
             yield command, listener, folder
         finally:

@@ -36,8 +36,12 @@ def test_an_observer_reads_a_run_until_it_ends(tmp_path: Path) -> None:
     command = start_echelon("run", "lab", "--set", "duration=4.0", *WALL, "--out", folder)
     assert opened(folder)
     assert stat.S_IMODE((folder / TICKET).stat().st_mode) == 0o600
+    ticket = Ticket.read(folder)
     done = echelon("observe", folder, "--under", "g2", "--channel", "state", "--json")
-    command.communicate()
+    _, said = command.communicate()
+    told = f"echelon observe {folder} (address {ticket.endpoint}, read-only secret in {folder / TICKET})"
+    assert f"open to observers: {told}" in said.splitlines()
+    assert ticket.password not in said
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0, done.stderr
     assert {line["from"] for line in lines} == {"g2/r4", "g2/r5", "g2/r6"}

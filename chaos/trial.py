@@ -91,7 +91,7 @@ class _Run:
                 self.waiting[hit] = subprocess.Popen(command_line, stdin=pipe, stdout=pipe, text=True)
 
     def _attack(self, hit: Hit) -> None:
-        """Lets an attack begin; nothing happens if there is no other host for it to come from."""
+        """Lets an attack begin; nothing happens if there is no other host for it to come from, or no secret for it to use."""
         if hit not in self.waiting:
             return
         elsewhere = hit.origin == "elsewhere"
@@ -99,6 +99,8 @@ class _Run:
             ticket: dict[str, Any] = json.loads((self.folder / "run" / "observe.json").read_text())
         except (OSError, ValueError):
             ticket = {}
+        if hit.secret == "observer" and not ticket:
+            return
         attack = Attack(
             hit.kind,
             self.plan.seed,

@@ -30,6 +30,7 @@ from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.kept_parts import keep_parts
+from echelon.sim.observing import TICKET
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
 from echelon.sim.parts.foreign_parts import patience_with_bridge, stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
@@ -120,7 +121,8 @@ def execute(
         )
         if supervisor.ticket is not None:
             supervisor.ticket.write(folder)
-            display.say(f"open to observers: echelon observe {folder}")
+            where = f"address {supervisor.ticket.endpoint}, read-only secret in {folder / TICKET}"
+            display.say(f"open to observers: echelon observe {folder} ({where})")
         outcome = supervisor.run()
     can = outcome.can
     if can is not None and (can.referee is None or outcome.stopped):

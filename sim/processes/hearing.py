@@ -1,7 +1,9 @@
 """What the supervisor hears: messages over the pipes of its children, their standard error, and their ends."""
 
 import os
+import pickle
 import time
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final
 
@@ -21,6 +23,7 @@ from echelon.sim.processes.to_supervisor import (
     Said,
     Waiting,
 )
+from echelon.sim.processes.understood import understood
 
 NOT_UNDERSTOOD: Final = "not understood"
 """Why the supervisor refuses what a process says over its pipe"""
@@ -63,11 +66,15 @@ class Hearing:
     def _hear(self, child: Child) -> None:
         """Reads one message of a child.  Raises RunError or DivergedError, as `serve` does."""
         try:
-            said: Said = child.control.recv()
+            content = child.control.recv_bytes()
         except (EOFError, OSError):
             child.control.close()
             return
-        except Exception:  # bytes that are no message of a process
+        said: Said | None = None
+        if content.startswith(pickle.PROTO) and content.endswith(pickle.STOP):  # noise may take gigabytes to read
+            with suppress(Exception):  # no message of a process
+                said = pickle.loads(content)
+        if said is None or not understood(said, child.spec, self._plan):
             self.refusals.count(child.name, NOT_UNDERSTOOD)
             return
         child.heard_s = time.monotonic()
@@ -99,8 +106,6 @@ class Hearing:
                 raise RunError(said.text)
             case Done():
                 child.done = said
-            case _:
-                self.refusals.count(child.name, NOT_UNDERSTOOD)
 
     def check_lost(self) -> None:
         """Raises RunError if a child has ended without its report."""

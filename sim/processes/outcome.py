@@ -95,7 +95,7 @@ def outcome_of(plan: Plan, processes: list[Done], failure: str | None, startup_s
     if can is not None:
         can = replace(can if drives is None else can.with_drives(drives), referee=_report(RefereeReport, processes))
     return Outcome(
-        trace=TraceBuilder(plan).build() if recorder is None else recorder.trace,
+        trace=TraceBuilder(plan).build() if recorder is None else replace(recorder.trace, plan=plan),
         links=[counts for process in processes for counts in process.links],
         processes=processes,
         can=can,

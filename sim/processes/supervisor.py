@@ -9,9 +9,9 @@ breaking off   a failure in one of the above, or   has the bridge stop all wheel
 finishing      members are done or ended           sends `Finish` to bridge, drives, referee and recorder, one after the other
 taking down    all of them are done                sends `End`; kills what is left
 
-The modules beside this one: `specs` lists the processes and `children` starts them; `hearing` reads what they say; `stalls`
-finds out who holds up a run; `endings` has the last three phases; `outcome` is what is told of a run, `failures` why it breaks
-off.
+The modules beside this one: `specs` lists the processes and `children` starts them; `hearing` reads what they say, if it is
+`understood`; `stalls` finds out who holds up a run; `endings` has the last three phases; `outcome` is what is told of a run,
+`failures` why it breaks off.
 
 All processes come from one fork server that has imported their modules, so fifteen start in the time of one.  No process
 outlives the supervisor: each notices the hang-up of its pipe and ends, even if the supervisor was killed; the bridge stops the

@@ -21,8 +21,12 @@ def references(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def chosen() -> list[ChaosPlan]:
-    """Returns the plans: of each kind of hit the first on each clock, and whatever comes until there are enough."""
-    plans = [draw(seed, short=True) for seed in range(300)]
+    """Returns the plans: of each kind of hit the first on each clock, and whatever comes until there are enough.
+
+    Messages over Zenoh are forged with an observer's secret in virtual time, and without one on a wall clock."""
+    secrets = {"virtual": "observer", "wall": "none"}
+    drawn = [draw(seed, short=True) for seed in range(300)]
+    plans = [plan for plan in drawn if plan.hits[0].kind != "forge_zenoh" or plan.hits[0].secret == secrets[plan.clock]]
     first = {(plan.hits[0].kind, plan.clock): plan for plan in reversed(plans)}
     others = [plan for plan in plans if plan not in first.values()]
     return sorted([*first.values(), *others][:PLANS], key=lambda plan: plan.seed)
@@ -33,6 +37,7 @@ def test_the_plans_are_of_all_kinds() -> None:
         (kind, clock) for kind in KINDS for clock in ("virtual", "wall")
     }
     assert {plan.path for plan in chosen()} == {"mirror", "closed"}
+    assert {plan.hits[0].secret for plan in chosen() if plan.hits[0].kind == "forge_zenoh"} == {"none", "observer"}
     assert len(chosen()) == PLANS
 
 
@@ -41,5 +46,10 @@ def test_a_run_keeps_its_promises_whatever_is_done_to_it(plan: ChaosPlan, tmp_pa
     if plan.needs_room and (why := room.why_none()) is not None and plan.hits[0].kind in TRAFFIC:
         assert not vcan_required(), why
         pytest.skip(f"NOT TESTED: nothing can be sent from another host, no network namespace can be made here: {why}")
-    found = carry_out_apart(plan, tmp_path / "plan", references, KINDS, True)
-    assert found.violations == [], f"{plan}\nagain: {repeat(plan, KINDS, True)}"
+    again = f"{plan}\nagain: {repeat(plan, KINDS, True)}"
+    for attempt in range(2):  # a run on a busy machine may be over before it is hit
+        found = carry_out_apart(plan, tmp_path / f"plan-{attempt}", references, KINDS, True)
+        assert found.violations == [], again
+        if found.carried_out:
+            break
+    assert (found.carried_out, found.missed) == (len(plan.hits), 0), again

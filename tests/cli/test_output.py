@@ -8,7 +8,8 @@ from subprocess import PIPE
 
 import pytest
 
-from support.runs import echelon, start_echelon, summary_of
+from echelon.sim.recording.mcap_reader import read_trace
+from support.runs import echelon, plan_of, start_echelon, summary_of
 
 FAILS = ("lab", "--set", "duration=0.5", "--set", "claims=[{block='*', settled_by=0.4}]", "--can", "none")
 
@@ -51,14 +52,31 @@ def test_what_prints_until_it_is_stopped_ends_with_its_reader(tmp_path: Path) ->
             command.kill()
 
 
+FULL = "echelon: standard output: No space left on device\n"
+
+
+def run_onto_a_full_disk(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
+    """Runs a command whose standard output is a full device."""
+    words = [sys.executable, "-m", "echelon", *map(str, arguments)]
+    with Path("/dev/full").open("w") as full:
+        return subprocess.run(words, stdout=full, stderr=PIPE, text=True, timeout=600, check=False)
+
+
 @pytest.mark.parametrize("arguments", [("scenarios",), ("dbc", "lab")])
 def test_a_full_disk_is_said_and_is_no_success(arguments: tuple[str, ...]) -> None:
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "echelon", *arguments], stdout=full, stderr=PIPE, text=True, timeout=600, check=False
-        )
-    assert done.returncode == 3
-    assert done.stderr == "echelon: standard output: No space left on device\n"
+    done = run_onto_a_full_disk(*arguments)
+    assert (done.returncode, done.stderr) == (3, FULL)
+
+
+def test_a_run_onto_a_full_disk_leaves_whole_files(tmp_path: Path) -> None:
+    folder, short = tmp_path / "run", ("--set", "duration=0.5", "--set", "claims=[]", "--set", "can.path=closed")
+    done = run_onto_a_full_disk("run", "lab", *short, "--can", "auto", "--quiet", "--out", folder)
+    assert (done.returncode, done.stderr) == (3, FULL)
+    summary = summary_of(folder)
+    assert (summary["verdict"]["word"], summary["run"]["failure"]) == ("HEALTHY", None)
+    assert read_trace(folder / "run.mcap", plan_of("lab", "duration=0.5")).digest() == summary["trace_digest"]
+    assert (folder / "can.log").read_bytes().count(b"\n") == summary["can"]["frames"]
+    assert (folder / "report.html").read_text().endswith("</html>\n")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])

@@ -1,6 +1,7 @@
 """Runs that diverge stop, and runs that are interrupted end between two instants.  Both leave a folder that says so."""
 
 import json
+import os
 import signal
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from echelon.sim.processes.watchers import RunRecorder
 from echelon.sim.recording.mcap_reader import read_trace
 from echelon.sim.run_folder import open_run
 from echelon.sim.run_state import goes_on, read_state
-from support.runs import echelon, plan_of, start_echelon, summary_of, until
+from support.runs import echelon, kill_session, plan_of, start_echelon, summary_of, until
 
 DIVERGING = ("--set", "claims=[]", "--set", "links=[{channel='state', delay=0.007}]", "--set", "duration=2.0")
 """A delay with which the paper's formation does not settle: it tolerates up to 6 ms (`echelon analyse paper`)"""
@@ -156,6 +157,28 @@ def test_a_signal_that_the_caller_ignores_stays_ignored() -> None:
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_run_goes_on_when_all_its_processes_get_a_signal_that_the_caller_ignores(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does; the command inherits it
+    try:
+        command = start_echelon("run", "lab", "--set", "duration=6", "--can", "auto", *CLOSED, "--out", folder)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    try:
+        log = folder / "can.log"
+        assert until(lambda: log.exists() and log.stat().st_size > 20_000), command.communicate(timeout=5)
+        os.killpg(command.pid, signal.SIGHUP)
+        assert goes_on(folder)
+        assert not (folder / "summary.json").exists()
+        said = command.communicate(timeout=600)
+    finally:
+        kill_session(command.pid)
+    assert command.returncode == 0, said
+    summary = summary_of(folder)
+    assert (summary["simulated"], summary["run"]["failure"]) == (6.0, None)
+    assert open_run(folder).trace.digest() == summary["trace_digest"]
 
 
 def test_a_run_says_where_its_buses_are_and_can_be_looked_at_while_it_goes_on(

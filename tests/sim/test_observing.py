@@ -2,8 +2,12 @@
 
 import json
 import os
+import re
 import stat
 import sys
+import tempfile
+import time
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from subprocess import PIPE, Popen
@@ -36,8 +40,12 @@ def test_an_observer_reads_a_run_until_it_ends(tmp_path: Path) -> None:
     command = start_echelon("run", "lab", "--set", "duration=4.0", *WALL, "--out", folder)
     assert opened(folder)
     assert stat.S_IMODE((folder / TICKET).stat().st_mode) == 0o600
+    ticket = Ticket.read(folder)
     done = echelon("observe", folder, "--under", "g2", "--channel", "state", "--json")
-    command.communicate()
+    _, said = command.communicate()
+    told = f"echelon observe {folder} (address {ticket.endpoint}, read-only secret in {folder / TICKET})"
+    assert f"open to observers: {told}" in said.splitlines()
+    assert ticket.password not in said
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0, done.stderr
     assert {line["from"] for line in lines} == {"g2/r4", "g2/r5", "g2/r6"}
@@ -60,12 +68,48 @@ for message in observe(Ticket.read(Path(sys.argv[1])), plan_of("lab", "duration=
 """
 
 
+def secrets_of(supervisor: Supervisor) -> set[str]:
+    """Returns all passwords of a run."""
+    credentials = [spec.credentials for spec in supervisor._specs]
+    credentials += [spec.gate.credentials for spec in supervisor._specs if spec.gate is not None]
+    return {who.password for each in credentials for who in (each.own, *each.guests, *each.hosts)}
+
+
+def readable(secrets: set[str], folder: Path, since_s: float) -> dict[str, set[str]]:
+    """Returns which secrets stand in command lines and environments of processes, in a folder, and in files that are new since
+    a time, in the folder for temporary files and in shared memory: by the name of the file."""
+    places = [path for one in ("cmdline", "environ") for path in Path("/proc").glob(f"[0-9]*/{one}")]
+    for root in (folder, Path(tempfile.gettempdir()), Path("/dev/shm")):
+        places += [Path(inside) / name for inside, _, names in os.walk(root) for name in names]
+    any_secret, found = re.compile("|".join(map(re.escape, sorted(secrets))).encode()), dict[str, set[str]]()
+    for place in places:
+        with suppress(OSError):  # it is gone, or another user's
+            told = place.lstat()
+            if stat.S_ISREG(told.st_mode) and (place.is_relative_to("/proc") or told.st_mtime >= since_s):
+                with place.open("rb") as file:
+                    if those := set(any_secret.findall(file.read(1 << 26))):
+                        found[str(place)] = {each.decode() for each in those}
+    return found
+
+
 def test_a_run_ends_well_though_an_observer_stands_still(tmp_path: Path) -> None:
-    """That a session on a wall clock never waits for a receiver is tested in tests/runtime/test_session.py."""
-    plan = plan_of("lab", "duration=15.0")
+    """Nobody can read the secrets of its processes meanwhile.  That a session on a wall clock never waits for a receiver is
+    tested in tests/runtime/test_session.py."""
+    plan, begun_s = plan_of("lab", "duration=15.0"), time.time()
     supervisor = Supervisor(plan, tmp_path, run=f"observed-{os.getpid()}", virtual=True, observe=True)
-    assert supervisor.ticket is not None
-    supervisor.ticket.write(tmp_path)
+    ticket, secrets = supervisor.ticket, secrets_of(supervisor)
+    assert ticket is not None
+    assert len(secrets) == len(supervisor._specs) + 2  # those of the gate and of its guest
+    ticket.write(tmp_path)
+    found: list[dict[str, set[str]]] = []
+
+    def look(progress: Progress) -> None:
+        """Looks for the secrets once, while all processes are there."""
+        if progress.phase == "running" and not found:
+            found.append(readable(secrets, tmp_path, begun_s - 1.0))
+            assert (tmp_path / "run.mcap").exists()
+
+    supervisor._show = look
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     with Popen([sys.executable, "-c", FROZEN, str(tmp_path)], stdout=PIPE, text=True, env=environment) as frozen:
         try:
@@ -77,6 +121,8 @@ def test_a_run_ends_well_though_an_observer_stands_still(tmp_path: Path) -> None
             frozen.kill()
     assert outcome.failure is None
     assert outcome.trace.digest() == trace_of(plan).digest()
+    found.append(readable(secrets, tmp_path, begun_s - 1.0))
+    assert found == [{str(tmp_path / TICKET): {ticket.password}}] * 2
 
 
 @pytest.mark.parametrize("name", ["endpoint", "user", "zenoh_id", "password", "run"])

@@ -3,15 +3,18 @@ plain Python, and beside VMAS.  `python -m bench.batch` measures them alone.
 
 The batch engine and the loops compute the law of all blocks with avoidance, each robot's inverse and limits, and its motion.
 The loops have no tree, no links and no measures.  Their runs must end where the batch engine's do.  `bench.vmas` says what VMAS
-computes.
+computes.  Beside them are the batch engine on a GPU, where there is one, with more robots, and a whole sweep with its tables.
 """
 
 import argparse
 import json
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 from typing import Final
 
@@ -26,7 +29,8 @@ from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.plan.plan import Array, Plan
 from echelon.shipped import shipped
-from echelon.sim.batch.batch import run_many
+from echelon.sim.batch.batch import Device, run_many
+from echelon.sim.batch.refusals import gpu_refusal
 from echelon.sim.parts.loading import load
 
 LATE: Final = (
@@ -34,9 +38,13 @@ LATE: Final = (
     '{source="**", receiver="**", channel="command", loss=0.1}]'
 )
 """States come 10 to 50 ms late, a tenth of them is lost, and a tenth of the commands"""
-RUNS: Final = {"batch": 400, "numpy": 400, "python": 1}
-"""Runs at once"""
-SECONDS: Final = {"batch": 30, "numpy": 2, "python": 5, "vmas": 2}
+RUNS: Final = {"batch": 400, "numpy": 400, "python": 1, "gpu": 65_536, "sweep": 8000, "spread": 43_200}
+"""Runs at once; `spread`: robots of all runs together"""
+SECONDS: Final = {"batch": 30, "numpy": 2, "python": 5, "vmas": 2, "gpu": 30, "sweep": 30, "spread": 3}
+SWEEPS: Final = 1
+"""Whole sweeps, at most: one alone takes as long as most of the rest"""
+SPREAD: Final = {9: (3, 3), 90: (10, 3, 3), 900: (10, 10, 3, 3)}
+"""Formations of several sizes: by the number of robots how many children there are in each layer, from the coordinator down"""
 
 
 def lab(seconds: float, *changes: str) -> Plan:
@@ -44,11 +52,45 @@ def lab(seconds: float, *changes: str) -> Plan:
     return load(shipped()["lab"], [f"duration={seconds}", *changes])[1]
 
 
-def batch(plan: Plan, runs: int) -> Array:
+def spread(sizes: Sequence[int], seconds: float) -> Plan:
+    """Returns the plan of a formation of lab.toml's robots, in rows of rows, with this number of children in each layer."""
+    numbers = count()
+
+    def group(layer: int, x: float, y: float) -> str:
+        """Returns the TOML of a group whose first child is at a place: rows along x and along y in turn."""
+        size, apart = sizes[layer], 0.8 * 4.0 ** (len(sizes) - 1 - layer)
+        kind, along = ("column", (-apart, 0.0)) if layer % 2 else ("line", (0.0, -apart))
+        places = [(x + at * along[0], y + at * along[1]) for at in range(size)]
+        if layer + 1 < len(sizes):
+            children = "groups={" + ",".join(f"g{next(numbers)}={group(layer + 1, *place)}" for place in places)
+        else:
+            children = "robots={" + ",".join(f"r{next(numbers)}={{start=[{x}, {y}]}}" for x, y in places)
+        return f'{{shape={{kind="{kind}", spacing={apart}}},{children}}}}}'
+
+    changes = f"formation={group(0, 0.0, 0.0)}", f"law.epsilon={[0.5] * len(sizes)}"
+    return lab(seconds, *changes, "claims=[]", "can.enabled=false", "avoidance.enabled=false")
+
+
+def batch(plan: Plan, runs: int, device: Device = "processor") -> Array:
     """Runs the batch engine; returns the robots' positions at the end of the first run, (N, 2)."""
     wanted = runs == 1
-    traces = run_many(plan, range(runs), traces=wanted, say=lambda text: None).traces
+    traces = run_many(plan, range(runs), device=device, traces=wanted, say=lambda text: None).traces
     return np.empty(0) if traces is None else np.asarray(traces[0, -1, :, :2])
+
+
+def on_gpu(plan: Plan, runs: int) -> Array:
+    """Runs the batch engine on a GPU."""
+    return batch(plan, runs, "gpu")
+
+
+def sweep_s() -> float:
+    """Makes a sweep of lab.toml by the command line, start and tables included; returns how long it takes [s]."""
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        command = [sys.executable, "-m", "echelon", "sweep", "lab", "--set", f"duration={SECONDS['sweep']}"]
+        command += ["--seeds", str(RUNS["sweep"]), "--quiet", "--out", folder]
+        begun_s = time.perf_counter()
+        subprocess.run(command, cwd=vmas.ROOT, stdout=subprocess.DEVNULL, check=True)
+        return time.perf_counter() - begun_s
 
 
 def plain_python(plan: Plan, runs: int) -> Array:
@@ -158,7 +200,7 @@ def rate(run: Callable[[Plan, int], Array], plan: Plan, runs: int) -> float:
 def measure(
     repeats: int, environments: Sequence[int] = (vmas.ENVIRONMENTS,), python: Path = vmas.PYTHON
 ) -> tuple[list[Row], dict[str, str]]:
-    """Measures all, in turn, VMAS with each number of environments; returns the rows, and why VMAS has none.
+    """Measures all, in turn, VMAS with each number of environments; returns the rows, and why VMAS or a GPU has none.
 
     Raises RuntimeError if a loop's runs do not end where they should."""
     short = lab(SECONDS["vmas"])
@@ -168,18 +210,29 @@ def measure(
             raise RuntimeError(f"{loop.__name__} ends elsewhere")
     peer = vmas.Vmas(short, where, python)
     failures = {} if peer.installed else {"vmas": vmas.MISSING}
-    kinds = {
+    kinds: dict[str, tuple[Callable[[Plan, int], Array], Plan, int]] = {
         "lab.toml, many runs: batch engine": (batch, lab(SECONDS["batch"]), RUNS["batch"]),
         "lab.toml, many runs: the same, late and lossy": (batch, lab(SECONDS["batch"], LATE), RUNS["batch"]),
         "lab.toml, many runs: loop of numpy arrays": (plain_numpy, lab(SECONDS["numpy"]), RUNS["numpy"]),
         "lab.toml, one run: loop in plain Python": (plain_python, lab(SECONDS["python"]), RUNS["python"]),
     }
+    for robots, sizes in SPREAD.items():
+        kinds[f"{robots} robots, many runs: batch engine"] = (
+            batch,
+            spread(sizes, SECONDS["spread"]),
+            1 + RUNS["spread"] // robots,
+        )
+    if why := gpu_refusal():
+        failures["gpu"] = why
+    else:
+        kinds["lab.toml, many runs: batch engine on the GPU"] = on_gpu, lab(SECONDS["gpu"]), RUNS["gpu"]
+        on_gpu(short, 1)  # compiles
     found: dict[str, list[float]] = {what: [] for what in kinds}
     points: dict[str, list[float]] = {}
     for _ in range(repeats):
         for what, kind in kinds.items():
             found[what].append(rate(*kind))
-        for number in environments if not failures else ():
+        for number in environments if "vmas" not in failures else ():
             try:
                 rates = peer.rates(number)
             except RuntimeError as error:
@@ -187,8 +240,11 @@ def measure(
                 break
             for way, value in rates.items():
                 points.setdefault(f"points in VMAS, {number} runs a core: {way}", []).append(value)
-    found |= points if not failures else {}
-    return [Row(what, "10⁶ steps/s", tuple(rates)) for what, rates in found.items()], failures
+    found |= points if "vmas" not in failures else {}
+    rows = [Row(what, "10⁶ steps/s", tuple(rates)) for what, rates in found.items()]
+    sweeps = tuple(sweep_s() for _ in range(min(repeats, SWEEPS)))
+    rows.append(Row(f"sweep: {RUNS['sweep']:,} runs of lab, {SECONDS['sweep']} s each, tables written", "s", sweeps))
+    return rows, failures
 
 
 def told(failures: dict[str, str]) -> str:

@@ -3,8 +3,10 @@
 import statistics
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from echelon.bridge.can.bus_url import resolve_url
 from echelon.planning.loading import effective_toml
@@ -15,6 +17,9 @@ from echelon.sim.parts.loading import load
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.run import execute
 from echelon.sim.view.live import Display
+
+LATE: Final = ('links=[{source="**", receiver="**", delay=0.005}]', "law.epsilon=[0.3, 0.3]")
+"""All links 5 ms late.  The formation is slower than the paper's, which would diverge with this delay"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +36,12 @@ class Row:
         return statistics.median(self.values)
 
 
-def paper_processes(seconds: float, *, recorded: bool, can: bool) -> tuple[float, float, float]:
-    """Runs `seconds` of paper.toml as processes; returns ticks per second, start-up time [s], and the largest memory of a
-    robot's process [MB]."""
-    scenario, plan = load(shipped()["paper"], [f"duration={seconds}"])
+def paper_processes(
+    seconds: float, *, recorded: bool, can: bool, changes: Sequence[str] = ()
+) -> tuple[float, float, float]:
+    """Runs `seconds` of paper.toml as processes, with `changes` as for `--set`; returns ticks per second, start-up time [s],
+    and the largest memory of a robot's process [MB]."""
+    scenario, plan = load(shipped()["paper"], [f"duration={seconds}", *changes])
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         outcome = Supervisor(
             plan,
@@ -79,18 +86,20 @@ def lab_in_process(*, whole: bool) -> float:
 
 def measure(repeats: int, seconds: float) -> list[Row]:
     """Measures everything `repeats` times, each kind of run in turn; `seconds` is the run time of paper.toml."""
-    full, bare, startups, memories, alone, whole = [], [], [], [], [], []
+    full, bare, late, startups, memories, alone, whole = [], [], [], [], [], [], []
     for _ in range(repeats):
         rate, startup, memory = paper_processes(seconds, recorded=True, can=True)
         full.append(rate)
         startups.append(startup)
         memories.append(memory)
         bare.append(paper_processes(seconds, recorded=False, can=False)[0])
+        late.append(paper_processes(seconds, recorded=False, can=False, changes=LATE)[0])
         alone.append(lab_in_process(whole=False))
         whole.append(lab_in_process(whole=True))
     return [
         Row("paper.toml as processes: laws, recorder, CAN", "ticks/s", tuple(full)),
         Row("paper.toml as processes: laws alone", "ticks/s", tuple(bare)),
+        Row("the same, all links 5 ms late", "ticks/s", tuple(late)),
         Row("lab.toml in one process: roles and links", "× real time", tuple(alone)),
         Row("lab.toml in one process: with recording and CAN", "× real time", tuple(whole)),
         Row("start-up of 15 processes", "s", tuple(startups)),

@@ -5,11 +5,12 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from bench import batch, lockstep, vmas
+from bench import batch, lockstep, product, vmas
 from bench.can import Robots, bus_rates, closed_in_process
 from bench.product import Row, table
 from echelon.bridge.can.bus import open_bus
@@ -18,6 +19,7 @@ from echelon.bridge.protocols.native.codec import NativeCodec, Torque
 from echelon.controller.laws.central import CentralLaw
 from echelon.controller.potential import potential
 from echelon.plan.plan import Array, Plan
+from echelon.sim.processes.supervisor import Supervisor
 from support.runs import ROOT
 
 
@@ -166,16 +168,69 @@ def test_a_process_without_vmas_has_failed_with_one_line(lab: Plan, robots: Arra
 @pytest.mark.parametrize(
     ("python", "told"),
     [
-        (ROOT / "no-such-environment", r"^vmas: not installed; `make bench-vmas` makes \.venv-vmas for it\n$"),
-        (Path(sys.executable), r"^vmas: failed: ModuleNotFoundError: No module named '(torch|vmas)'\n$"),
+        (ROOT / "no-such-environment", r"^vmas: not installed; `make bench-vmas` makes \.venv-vmas for it$"),
+        (Path(sys.executable), r"^vmas: failed: ModuleNotFoundError: No module named '(torch|vmas)'$"),
     ],
 )
-def test_without_vmas_the_others_are_measured(monkeypatch: pytest.MonkeyPatch, python: Path, told: str) -> None:
+def test_without_vmas_and_gpu_the_others_are_measured(monkeypatch: pytest.MonkeyPatch, python: Path, told: str) -> None:
     monkeypatch.setattr(batch, "SECONDS", dict.fromkeys(batch.SECONDS, 0.1))
     monkeypatch.setattr(batch, "RUNS", dict.fromkeys(batch.RUNS, 1))
+    monkeypatch.setattr(batch, "SPREAD", {size: batch.SPREAD[size] for size in (9, 90)})
+    monkeypatch.setattr(batch, "gpu_refusal", lambda: "engine gpu: there is none")
+    monkeypatch.setattr(batch, "sweep_s", lambda: 25.0)
     rows, failures = batch.measure(1, python=python)
-    assert len(rows) == 4
-    assert re.search(told, batch.told(failures))
+    assert [row.what for row in rows[4:]] == [
+        "9 robots, many runs: batch engine",
+        "90 robots, many runs: batch engine",
+        "sweep: 1 runs of lab, 0.1 s each, tables written",
+    ]
+    assert [row.unit for row in rows] == ["10⁶ steps/s"] * 6 + ["s"]
+    assert sorted(failures) == ["gpu", "vmas"]
+    assert re.search(told, batch.told(failures), re.MULTILINE)
+    assert "gpu: engine gpu: there is none\n" in batch.told(failures)
+
+
+def test_with_a_gpu_it_has_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[float, int]] = []
+    monkeypatch.setattr(batch, "SECONDS", dict.fromkeys(batch.SECONDS, 0.1))
+    monkeypatch.setattr(batch, "RUNS", {**dict.fromkeys(batch.RUNS, 1), "gpu": 12})
+    monkeypatch.setattr(batch, "SPREAD", {})
+    monkeypatch.setattr(batch, "gpu_refusal", lambda: None)
+    monkeypatch.setattr(batch, "on_gpu", lambda plan, runs: asked.append((plan.duration_ns / 1e9, runs)))
+    monkeypatch.setattr(batch, "sweep_s", lambda: 25.0)
+    rows, failures = batch.measure(1, python=ROOT / "no-such-environment")
+    assert rows[4].what == "lab.toml, many runs: batch engine on the GPU"
+    assert asked[-1] == (0.1, 12)
+    assert list(failures) == ["vmas"]
+
+
+def test_formations_of_all_sizes_are_of_labs_robots() -> None:
+    nine, ninety = (batch.spread(batch.SPREAD[robots], 0.1) for robots in (9, 90))
+    assert (len(nine.robots), len(ninety.robots)) == (9, 90)
+    assert {robot.mass for robot in ninety.robots} == {batch.lab(0.1).robots[0].mass}
+    starts = np.array([robot.start for robot in ninety.robots])
+    apart = np.hypot(*(starts[:, None] - starts).T) + 9 * np.eye(90)
+    assert apart.min() == pytest.approx(0.8)  # nobody starts at the place of another one
+    assert batch.rate(batch.batch, ninety, 2) > 0
+
+
+def test_a_whole_sweep_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "SECONDS", {"sweep": 0.1})
+    monkeypatch.setattr(batch, "RUNS", {"sweep": 3})
+    assert 0.1 < batch.sweep_s() < 600
+
+
+def test_delayed_runs_as_processes_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans: list[Plan] = []
+
+    class Noted(Supervisor):
+        def __init__(self, plan: Plan, folder: Path, **options: Any) -> None:
+            plans.append(plan)
+            super().__init__(plan, folder, **options)
+
+    monkeypatch.setattr(product, "Supervisor", Noted)
+    assert product.paper_processes(0.05, recorded=False, can=False, changes=product.LATE)[0] > 0
+    assert {link.delay_min_ns for link in plans[0].links} == {5_000_000}
 
 
 @pytest.fixture(scope="module")

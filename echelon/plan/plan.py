@@ -6,7 +6,7 @@ Members have an index: first the robots in the order of the tree, then the nodes
 The blocks of the transformed state (docs/architecture.md, 2.3) are in the order of their nodes; the centroid is last.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -206,16 +206,16 @@ class Plan:
     bus_roles: tuple[BusRolePlan, ...] = ()
     """On the closed torque path (`can.closed`) the bridge, then the virtual drives if there are any; otherwise empty.  Their
     indices come after those of the nodes"""
+    coupled: bool = field(init=False, repr=False, compare=False)
+    """True if a block is coupled to another block, so that messages must carry error rates"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coupled", bool(self.coupling.any()))
 
     @property
     def root(self) -> NodePlan:
         """The coordinator's node."""
         return self.nodes[-1]
-
-    @property
-    def coupled(self) -> bool:
-        """True if a block is coupled to another block, so that messages must carry error rates."""
-        return bool(self.coupling.any())
 
     @property
     def formation(self) -> tuple[RobotPlan | NodePlan, ...]:

@@ -13,6 +13,7 @@ from echelon.shipped import scenario_path
 from echelon.sim.report.page import header, page, paragraph, section, subheading, table
 from echelon.sim.report.studies.figures import save_study_figures, study_sections
 from echelon.sim.report.studies.results import Key, StudyResults
+from echelon.sim.studies.beside import with_line
 from echelon.sim.studies.from_sweep import results_of
 from echelon.sim.studies.study_file import Number, Study, SweepPart
 from echelon.sim.sweep.origin import Origin
@@ -79,6 +80,9 @@ def make(study: Study, out: Path, formats: Sequence[str], say: Say = lambda text
         folder = out / part.name
         folder.parent.mkdir(parents=True, exist_ok=True)
         results[part.name] = replace(results_of(run(one, folder)), command=command_of(part))
+    for part in study.sweeps:
+        if part.beside is not None:
+            results[part.beside] = with_line(results[part.beside], results[part.name], part.name)
     measured = [Measured(number, measure(number, results)) for number in study.numbers]
     for name, found in results.items():
         save_study_figures(found, out / "figures" / name, formats)

@@ -28,6 +28,8 @@ class SweepPart:
     seeds: int | None = None
     engine: str | None = None
     allow_unstable: bool = False
+    beside: str | None = None
+    """The sweep in whose figures this one is a line, too; what it varies counts as the axis of that sweep"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +98,8 @@ def parse_study(table: Mapping[str, Any], name: str, where: str) -> Study:
     names = [one.name for one in sweeps]
     if twice := [name for name in names if names.count(name) > 1]:
         raise UsageError(f"{where}: sweeps: two of them have the name {twice[0]!r}")
+    for part in sweeps:
+        _check_beside(part, sweeps, where)
     for number in numbers:
         for place in (number, *([] if number.over is None else [_divisor(number, where)])):
             if place.sweep not in names:
@@ -104,6 +108,20 @@ def parse_study(table: Mapping[str, Any], name: str, where: str) -> Study:
             raise UsageError(f"{where}: numbers: {number.says!r}: value and within must be finite, within at least 0")
     rest = {key: value for key, value in table.items() if key not in ("scenario", "sweeps", "numbers")}
     return _made(Study, {**rest, "name": name, "sweeps": tuple(sweeps), "numbers": tuple(numbers)}, where)
+
+
+def _check_beside(part: SweepPart, sweeps: Sequence[SweepPart], where: str) -> None:
+    """Raises UsageError if a sweep cannot be a line in the figures of another one."""
+    if part.beside is None:
+        return
+    host = next((one for one in sweeps if one.name == part.beside and one.beside is None), None)
+    if host is None:
+        raise UsageError(f"{where}: sweeps: {part.name}: beside: there is no other sweep {part.beside!r}")
+    if len(part.vary) != 1 or len(host.vary) < 2 or host.zip or part.find or host.find or part.seeds != host.seeds:
+        raise UsageError(
+            f"{where}: sweeps: {part.name}: beside: one key must vary here, and in {host.name!r} several as a grid; "
+            "both without find, with the same number of seeds"
+        )
 
 
 def _divisor(number: Number, where: str) -> Number:

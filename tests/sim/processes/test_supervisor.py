@@ -125,6 +125,39 @@ def test_links_of_every_kind_do_the_same_between_processes(tmp_path: Path) -> No
     assert sum(link.duplicates for link in of_channel[Channel.COMMAND])
 
 
+BROUGHT = (
+    'links=[{channel="state",delay={min=0.003,max=0.06},loss=0.1,policy="POLICY"},'
+    '{channel="group_state",delay={min=0.003,max=0.06},loss=0.1,policy="POLICY"},{channel="command",delay=0.012,loss=0.05}]'
+)
+"""Late and lossy links; `POLICY` stands for what is done with states"""
+
+
+@pytest.mark.parametrize(
+    ("policy", "timing"),
+    [
+        ("extrapolate", ('timing="time_driven"',)),
+        (
+            "predict",
+            ('formation.groups.g1.timing="time_driven"', 'formation.groups.g2.robots.r4.timing="time_driven"'),
+        ),
+    ],
+    ids=["extrapolate, time-driven", "predict, one group and one robot time-driven"],
+)
+def test_policies_and_timings_do_the_same_between_processes(
+    tmp_path: Path, policy: str, timing: tuple[str, ...]
+) -> None:
+    plan = plan_of("lab", "duration=0.5", BROUGHT.replace("POLICY", policy), *timing)
+    outcome = supervised(plan, tmp_path)
+    assert outcome.failure is None
+    assert outcome.trace.digest() == trace_of(plan).digest()
+    # each of them makes it another run
+    others = [plan_of("lab", "duration=0.5", BROUGHT.replace("POLICY", "hold"), *timing)]
+    for left_out in range(len(timing)):
+        changes = (*timing[:left_out], *timing[left_out + 1 :])
+        others.append(plan_of("lab", "duration=0.5", BROUGHT.replace("POLICY", policy), *changes))
+    assert outcome.trace.digest() not in [trace_of(other).digest() for other in others]
+
+
 def test_links_are_told_while_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes tell their links once a second; the run is long enough that none ends before."""
     plan = plan_of("lab", "duration=25.0", 'links=[{channel="state",loss=0.5}]')

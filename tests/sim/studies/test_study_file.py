@@ -59,6 +59,16 @@ def test_the_sweeps_of_shipped_studies_can_begin(name: str) -> None:
         ({"numbers": [NUMBER | {"over": {"sweep": "b"}}]}, "numbers: there is no sweep 'b'; there are a"),
         ({"numbers": [NUMBER | {"over": {"at": 1}}]}, "numbers: '1.5': over: at = 1: is of the wrong type"),
         ({"numbers": [NUMBER | {"over": {"rows": 1}}]}, "numbers: '1.5': over: rows: there is no such key"),
+        ({"sweeps": [{"name": "a", "beside": "a"}]}, "sweeps: a: beside: there is no other sweep 'a'"),
+        (
+            {
+                "sweeps": [
+                    {"name": "a", "vary": ["law.lead=0,0.5"]},
+                    {"name": "b", "beside": "a", "vary": ["law.lead=0,1"]},
+                ]
+            },
+            "sweeps: b: beside: one key must vary here, and in 'a' several as a grid",
+        ),
         ({"numbers": [NUMBER | {"within": -1.0}]}, "numbers: '1.5': value and within must be finite"),
     ],
 )

@@ -48,8 +48,8 @@ def links_lines(found: "AnalysisResult") -> list[str]:
     counts = {each.runs for one in classes for each in (one.delay_by_runs, one.loss_by_runs) if each is not None}
     if counts:
         lines.append(
-            f"    estimated by {max(counts)} runs for each value: the mean of |e|² shrinks up to it (with 95 % up to, with 95 % it "
-            "grows from); where rare runs carry the mean, links bear less than these runs show"
+            f"    estimated by {max(counts)} runs for each value: the mean of |e|² shrinks up to it (95 % sure up to, "
+            "95 % sure to grow from); where rare runs carry the mean, links bear less than these runs show"
         )
     lines += [f"  loss is not exact: {why}" for why in reasons]
     return [*lines, *(_bursts(one, one.bursts, reasons) for one in classes if one.bursts is not None)]

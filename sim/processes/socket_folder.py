@@ -16,7 +16,7 @@ FOLDER: Final = "ECHELON_SOCKET_FOLDER"
 
 def remove(supervisor: int, folder: Path) -> None:
     """Removes the folder and the sockets in it, unless the supervisor is still there to do so.  What is no socket stays."""
-    if os.getppid() == supervisor:
+    if os.getppid() == supervisor and not _is_dying(supervisor):
         return
     try:
         for path in folder.iterdir():
@@ -25,6 +25,15 @@ def remove(supervisor: int, folder: Path) -> None:
         folder.rmdir()
     except OSError:  # somebody has put something else there
         pass
+
+
+def _is_dying(process: int) -> bool:
+    """Returns whether a process is about to end: it has closed its files, of which one tells the fork server to end, but may
+    still be the parent of its children."""
+    try:
+        return not os.listdir(f"/proc/{process}/fd")
+    except OSError:
+        return True
 
 
 if FOLDER in os.environ:

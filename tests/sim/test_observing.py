@@ -36,13 +36,16 @@ def opened(folder: Path) -> bool:
 
 
 def test_an_observer_reads_a_run_until_it_ends(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    command = start_echelon("run", "lab", "--set", "duration=4.0", *WALL, "--out", folder)
-    assert opened(folder)
-    assert stat.S_IMODE((folder / TICKET).stat().st_mode) == 0o600
-    ticket = Ticket.read(folder)
-    done = echelon("observe", folder, "--under", "g2", "--channel", "state", "--json")
-    _, said = command.communicate()
+    for duration in (4.0, 20.0, 100.0):  # on a busy machine a run may be over before the observer has started
+        folder = tmp_path / f"run-{duration:g}"
+        command = start_echelon("run", "lab", "--set", f"duration={duration}", *WALL, "--out", folder)
+        assert opened(folder)
+        assert stat.S_IMODE((folder / TICKET).stat().st_mode) == 0o600
+        ticket = Ticket.read(folder)
+        done = echelon("observe", folder, "--under", "g2", "--channel", "state", "--json")
+        _, said = command.communicate()
+        if "does not answer" not in done.stderr:
+            break
     told = f"echelon observe {folder} (address {ticket.endpoint}, read-only secret in {folder / TICKET})"
     assert f"open to observers: {told}" in said.splitlines()
     assert ticket.password not in said
@@ -50,7 +53,7 @@ def test_an_observer_reads_a_run_until_it_ends(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert {line["from"] for line in lines} == {"g2/r4", "g2/r5", "g2/r6"}
     assert {line["channel"] for line in lines} == {"state"}
-    assert lines[-1]["t"] > 3.9
+    assert lines[-1]["t"] > duration - 0.1
     assert all(abs(line["values"]["x"]) < 10 for line in lines)
     again = echelon("observe", folder)
     assert (again.returncode, again.stdout) == (2, "")

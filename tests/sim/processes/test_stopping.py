@@ -226,6 +226,20 @@ def test_a_supervisor_that_is_killed_leaves_no_temporary_folder(clock: tuple[str
             kill_session(command.pid)
 
 
+def test_a_supervisor_that_is_dying_counts_as_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed process closes its files before its children get another parent."""
+    with subprocess.Popen(["sleep", "1000"]) as supervisor:
+        monkeypatch.setattr(os, "getppid", lambda: supervisor.pid)
+        remove(supervisor.pid, tmp_path)
+        assert tmp_path.is_dir()
+        supervisor.kill()
+        os.waitid(
+            os.P_PID, supervisor.pid, os.WEXITED | os.WNOWAIT
+        )  # not waited for, it stays in the table of processes
+        remove(supervisor.pid, tmp_path)
+        assert not tmp_path.exists()
+
+
 def test_what_others_have_put_beside_the_socket_stays(tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.write_text("mine")

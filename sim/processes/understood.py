@@ -81,6 +81,8 @@ def _has_robot(said: object, plan: Plan) -> bool:
 
 def _fits(value: object, kind: Any) -> bool:
     """Returns whether a value is of a type, and all that is in it of the types that its records name."""
+    named = getattr(get_origin(kind) or kind, "__value__", None)  # newer versions of numpy name the type of arrays
+    kind = kind if named is None else named
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
@@ -98,7 +100,7 @@ def _fits(value: object, kind: Any) -> bool:
         if len(parts) == 2 and parts[1] is Ellipsis:
             return all(_fits(each, parts[0]) for each in value)
         return len(value) == len(parts) and all(map(_fits, value, parts))
-    if origin is not None and issubclass(origin, Mapping):
+    if isinstance(origin, type) and issubclass(origin, Mapping):
         return isinstance(value, dict) and all(
             _fits(name, parts[0]) and _fits(each, parts[1]) for name, each in value.items()
         )

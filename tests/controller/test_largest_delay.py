@@ -75,6 +75,7 @@ def test_a_delay_just_before_an_instant_may_be_worse_than_one_at_it():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_long_delays_have_an_answer():
     """In ticks of 1 ms the delay is more than 700: the truth is that of continuous time, less the hold."""
     for lead, expected in ((0.5, 711), (0.0, 710)):
@@ -172,6 +173,7 @@ def test_in_a_chain_of_late_links_every_delay_up_to_the_largest_is_stable(seed, 
     assert radius(1.003 * found.seconds) >= 1
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 5, 7, 8])
 def test_points_of_random_formations_grow_beyond_the_largest_delay_and_not_before(seed, monkeypatch):

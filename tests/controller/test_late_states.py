@@ -84,6 +84,7 @@ def test_with_prediction_late_points_move_as_points_without_delay(ticks, monkeyp
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_state_older_than_five_times_what_hold_bears_is_no_matter_with_prediction(monkeypatch):
     """Below the period, in an event-driven tree with coupling: points under delays of 1.76 s, where `hold` bears 0.35 s."""
     plan = at_rest(plan_of("lab", "duration=10"))

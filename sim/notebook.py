@@ -202,11 +202,13 @@ def analyse(
     runs      runs of the batch engine for each number that can only be estimated; 0: leave them out
 
     Raises UserError for a wrong scenario or option, and for a scenario that cannot be analysed."""
-    from echelon.sim.forecast.analysing import analysis_of_scenario
+    from echelon.sim.forecast.analysing import analysis_of, told_of
     from echelon.sim.forecast.motion import asked_of
 
     found, plan = load(scenario, changes)
-    return analysis_of_scenario(found, plan, asked_of(plan), found.name, members=members, policies=policies, runs=runs)
+    law, asked = found.law, asked_of(plan)
+    with told_of(found.name):
+        return analysis_of(plan, law.time_scales, law.epsilon, asked, members=members, policies=policies, runs=runs)
 
 
 def open_sweep(folder: str | Path) -> "Sweep":

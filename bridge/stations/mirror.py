@@ -134,7 +134,8 @@ class MirrorBridge(Bridge):
         self._log.flush()
 
     def close(self) -> None:
-        """Closes log and buses."""
+        """Closes log and buses, after a last look at what others sent."""
+        self._look()
         self._log.close()
         for bus in self._buses:
             bus.close()
@@ -159,8 +160,8 @@ class MirrorBridge(Bridge):
             bus.guard.look_outside()
 
     def report(self) -> CanReport:
-        """Returns the report of the run, with the load that the frames would make on real buses."""
-        self._look()
+        """Returns the report of the run up to the last look at the buses (`progress`, `close`), with the load that the frames
+        would make on real ones."""
         loads, fit = self._loads(), plan_fit(self._plan)
         return CanReport(
             path="mirror",

@@ -47,7 +47,7 @@ def analyse(options: AnalyseOptions) -> int:
     Returns exit code 1 if it does not settle, or if the torque loop of a robot diverges."""
     from echelon.cli.analyse_text import lines_of
     from echelon.cli.scenario_file import read_scenario
-    from echelon.sim.forecast.analysing import analysis_of_scenario
+    from echelon.sim.forecast.analysing import analysis_of, told_of
     from echelon.sim.forecast.motion import asked_of, torque_loop_warnings
     from echelon.sim.results.rendering import json_text
 
@@ -55,21 +55,22 @@ def analyse(options: AnalyseOptions) -> int:
         raise UsageError(f"--format {options.format[0]}: needs --figures DIR, which writes the figures as files")
     scenario, plan = read_scenario(options.scenario, options.overrides)
     asked = asked_of(plan)
-    progress = _Progress()
+    law, progress = scenario.law, _Progress()
     try:
-        found = analysis_of_scenario(
-            scenario,
-            plan,
-            asked,
-            options.scenario,
-            members=options.members,
-            policies=options.policies,
-            runs=options.runs,
-            say=progress.say,
-        )
+        with told_of(options.scenario):
+            found = analysis_of(
+                plan,
+                law.time_scales,
+                law.epsilon,
+                asked,
+                members=options.members,
+                policies=options.policies,
+                runs=options.runs,
+                say=progress.say,
+            )
     finally:
         progress.end()
-    written = [] if options.figures is None else _save_figures(options, found, plan, scenario.law, progress)
+    written = [] if options.figures is None else _save_figures(options, found, plan, law, progress)
     if options.json:
         print(json_text(found))
     else:

@@ -1,6 +1,7 @@
 """Everything that `echelon analyse` predicts about a plan, as one record (`sim.results.analysis`)."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from math import exp, inf
 from typing import Final, TypeVar
 
@@ -23,7 +24,6 @@ from echelon.controller.prediction.time_scales import (
 from echelon.errors import UserError
 from echelon.plan.link_plan import LinkPlan
 from echelon.plan.plan import Plan
-from echelon.scenario.tables import Scenario
 from echelon.sim.forecast.estimating import RUNS, Estimates, is_random
 from echelon.sim.forecast.link_rows import LinkRows, Say, finite, links_result
 from echelon.sim.forecast.motion import Asked
@@ -51,27 +51,11 @@ Made = TypeVar("Made")
 Value = TypeVar("Value", float, str)
 
 
-def analysis_of_scenario(
-    scenario: Scenario,
-    plan: Plan,
-    asked: Asked,
-    name: str,
-    *,
-    members: bool = False,
-    policies: bool = False,
-    runs: int = RUNS,
-    say: Say = lambda what, done, of: None,
-) -> AnalysisResult:
-    """Returns all predictions about a scenario, which errors call `name`; the options are those of `analysis_of`.
-
-    Raises UserError if it cannot be analysed, or for a number of runs that is not allowed."""
-    if not 0 <= runs <= MOST_RUNS:
-        raise UserError(f"--runs {runs}: must be from 0 to {MOST_RUNS}")
-    law = scenario.law
+@contextmanager
+def told_of(name: str) -> Iterator[None]:
+    """A context in which a scenario that cannot be analysed is a user's mistake: the error calls it `name`."""
     try:
-        return analysis_of(
-            plan, law.time_scales, law.epsilon, asked, members=members, policies=policies, runs=runs, say=say
-        )
+        yield
     except PredictionError as error:
         raise UserError(f"{name}: cannot be analysed; run it instead: {error}") from None
 
@@ -93,7 +77,10 @@ def analysis_of(
     `members`: also for each robot and each group.  `policies`: also what each policy buys.  `runs` is the number of runs where
     something is estimated.  `say` gets the progress.
 
-    Raises PredictionError if the law is not linear, or if nothing can be said about the links as they are."""
+    Raises PredictionError if the law is not linear, or if nothing can be said about the links as they are, and UserError for a
+    number of runs that is not allowed."""
+    if not 0 <= runs <= MOST_RUNS:
+        raise UserError(f"--runs {runs}: must be from 0 to {MOST_RUNS}")
     say("stability", 0, 1)
     for block in plan.blocks:
         linear_gains(plan, block)

@@ -1,7 +1,7 @@
 """The built-in parts, and the loading of scenarios with them."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from echelon.planning.loading import ScenarioError
 from echelon.plugins import Part, PartError, Plugin, Source
 from echelon.scenario.tables import Scenario
 from echelon.sim.parts.probe import probe
-from echelon.sim.parts.time_limit import TookTooLong, time_limit
+from echelon.sim.parts.time_limit import no_longer
 
 LOAD_PATIENCE_S: Final = 20.0
 """Time limit for reading a part's file or importing an installed part, and for the trial of a protocol [s]"""
@@ -32,31 +32,21 @@ class PatientRegistry(Registry):
         """Returns the class that `use` names, and its source if it is a file in `folder`.
 
         Raises PartError if it cannot be found or takes too long."""
-        with _patience(use):
+        with _to_load(use):
             return super().find(group, use, folder)
 
     def make(self, group: str, use: str, parameters: Mapping[str, Any], folder: Path) -> Part[Any]:
         """Returns a part of a group with checked parameters.  Raises PartError if it cannot be made or takes too long."""
-        with _patience(use):
+        with _to_load(use):
             return super().make(group, use, parameters, folder)
 
 
-@contextmanager
-def _patience(use: str) -> Iterator[None]:
-    try:
-        with time_limit(LOAD_PATIENCE_S):
-            yield
-    except TookTooLong:
-        raise PartError(f"{use} takes longer than {LOAD_PATIENCE_S:g} s to load") from None
+def _to_load(use: str) -> AbstractContextManager[None]:
+    return no_longer(LOAD_PATIENCE_S, PartError(f"{use} takes longer than {LOAD_PATIENCE_S:g} s to load"))
 
 
-@contextmanager
-def _trial(who: str) -> Iterator[None]:
-    try:
-        with time_limit(LOAD_PATIENCE_S):
-            yield
-    except TookTooLong:
-        raise PartRunError(f"{who} takes longer than {LOAD_PATIENCE_S:g} s to be tried") from None
+def _to_be_tried(who: str) -> AbstractContextManager[None]:
+    return no_longer(LOAD_PATIENCE_S, PartRunError(f"{who} takes longer than {LOAD_PATIENCE_S:g} s to be tried"))
 
 
 REGISTRY: Final = PatientRegistry(
@@ -91,7 +81,7 @@ def _tried(name: str, scenario: Scenario, plan: Plan) -> tuple[Scenario, Plan]:
     """Returns scenario and plan after a trial of the users' parts."""
     try:
         probe(plan)
-        try_protocols(plan, _trial)
+        try_protocols(plan, _to_be_tried)
     except PartRunError as error:
         raise ScenarioError(f"{name}: {error}") from error.__cause__  # what the part raised, for --debug
     return scenario, plan

@@ -18,7 +18,7 @@ from echelon.controller.transformation import Transformation
 from echelon.errors import PartRunError
 from echelon.plan.plan import Array, Plan, RobotPlan
 from echelon.plugins import Part
-from echelon.sim.parts.time_limit import TookTooLong, time_limit
+from echelon.sim.parts.time_limit import no_longer
 
 PATIENCE_S: Final = 2.0
 """Time limit of one call [s]"""
@@ -53,11 +53,8 @@ def probe(plan: Plan) -> None:
 
 
 def _asked(who: str, ask: Callable[[], _T]) -> _T:
-    try:
-        with time_limit(PATIENCE_S):
-            return ask()
-    except TookTooLong:
-        raise PartRunError(f"{who} takes longer than {PATIENCE_S:g} s") from None
+    with no_longer(PATIENCE_S, PartRunError(f"{who} takes longer than {PATIENCE_S:g} s")):
+        return ask()
 
 
 def _probe_trajectory(plan: Plan) -> None:

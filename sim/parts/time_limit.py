@@ -57,3 +57,13 @@ def time_limit(seconds: float) -> Iterator[Limit]:
         signal.signal(signal.SIGALRM, signal.SIG_DFL if handler is None else handler)
         if left_s > 0:
             signal.setitimer(signal.ITIMER_REAL, max(1e-3, left_s - (time.monotonic() - begun_s)), repeat_s)
+
+
+@contextmanager
+def no_longer(seconds: float, late: Exception) -> Iterator[None]:
+    """A context that raises `late` if its block takes longer than `seconds`."""
+    try:
+        with time_limit(seconds):
+            yield
+    except TookTooLong:
+        raise late from None

@@ -75,7 +75,21 @@ def test_a_mirror_finds_an_intruder_behind_a_flood(tmp_path: Path) -> None:
         while (heard := listener.recv(60.0)) is not None and heard.can_id != 0x7F1:
             pass
         assert heard is not None  # so all have come
+        mirror.progress()
         (one,) = mirror.report().intrusions
+    assert (one.id, one.frames) == ("100", 1)
+
+
+def test_a_mirror_looks_a_last_time_before_it_closes_its_buses(tmp_path: Path) -> None:
+    """What others send after the last progress would stay unnoticed: a run of a third of a second shows its progress once."""
+    mirror = MirrorBridge(plan_of("lab", "claims=[]"), [free_multicast_url()], tmp_path)
+    with open_bus(mirror.url) as stranger, open_bus(mirror.url) as listener:
+        assert mirror.progress().frames == 0
+        stranger.send(0x100, b"x")
+        assert listener.recv(60.0) is not None  # so it has come
+        mirror.stop()
+        mirror.close()
+    (one,) = mirror.report().intrusions
     assert (one.id, one.frames) == ("100", 1)
 
 

@@ -1,6 +1,7 @@
 """Nobody on another host can speak on a multicast bus.  Attacks come over a cable from a network namespace beside this one."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -163,7 +164,10 @@ def test_forged_torque_and_feedback_move_no_wheel_and_fail_the_verdict(
         attacker.kill()
         attacker.communicate()
     assert done.returncode == 1, done.stderr
-    assert f"came from elsewhere: {THERE} sent 100 on can0, " in done.stdout
+    # the most frequent first: which one that is, is a matter of where in the attacker's round the run ended
+    assert re.search(rf"came from elsewhere: {re.escape(THERE)} sent (100|180) on can0, \d+ times", done.stdout), (
+        done.stdout
+    )
     log = (tmp_path / "run" / "can.log").read_text()
     assert not any(f"{can_id:03X}#{data.hex().upper()}" in log for can_id, data in forged)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

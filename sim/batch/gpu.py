@@ -19,7 +19,7 @@ if not hasattr(np, "row_stack"):
 from numba import config, cuda
 
 from echelon.errors import UsageError
-from echelon.sim.batch import ages, angles, philox, whole_run
+from echelon.sim.batch import ages, angles, philox, streams, whole_run
 from echelon.sim.batch.compiled import cache_folder
 from echelon.sim.batch.lane import WIDTH, lane_of, upto
 from echelon.sim.batch.outcomes import Kept
@@ -84,7 +84,7 @@ def on_gpu(function: Callable[..., Any]) -> Any:
 
 def make_kernel(**options: Any) -> Any:
     """Returns the kernel: each thread makes the runs `lane`, `lane` + number of lanes, … of a model."""
-    one_run, find_percentiles = on_gpu(whole_run.whole_run), on_gpu(ages.find_percentiles)
+    one_run, finish = on_gpu(whole_run.whole_run), on_gpu(streams.finish)
 
     def many_runs(
         model: Any, keys: Any, real: Any, whole: Any, traces: Any, sums: Any, lost_ns: Any,
@@ -100,7 +100,7 @@ def make_kernel(**options: Any) -> Any:
             trace = traces[min(number, len(traces) - 1)]
             lost_ns[number] = one_run(model, keys[number], my_real, my_whole, trace, sums)
             for at in range(len(model.links)):
-                find_percentiles(model.links[at], model.run[0], my_whole)
+                finish(model.links[at], model.run[0], my_whole)
             for place in range(len(kept_reals)):
                 reals[place, number] = my_real[kept_reals[place]]
             for place in range(len(kept_wholes)):

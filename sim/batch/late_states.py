@@ -14,7 +14,7 @@ from typing import Any
 
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired
-from echelon.sim.batch.records import COMMAND_REALS, EXTRAPOLATED, PREDICTED
+from echelon.sim.batch.records import COMMAND_REALS, EXTRAPOLATED, PREDICTED, REFERENCES
 
 
 @fused
@@ -46,11 +46,10 @@ def note_commands(node: Any, real: Any, whole: Any, time_ns: int, commanded: boo
 @fused
 def bring(
     node: Any, run: Any, link: Any, table: Any, index: Any, real: Any, whole: Any, child: int, said: int, time_ns: int,
-    since_ns: int, now_x: float, now_y: float, now_vx: float, now_vy: float,
+    since_ns: int,
 ) -> None:  # fmt: skip
-    """Moves a child's state, which was said at `said` in `real`, from `since_ns` on to `time_ns`, by the policy of its link.
-
-    `now_x` to `now_vy`: the reference and its velocity at `time_ns`, if it is moved on as the reference has moved."""
+    """Moves a child's state, which was said at `said` in `real`, from `since_ns` on to `time_ns`, by the policy of its link, or
+    as the reference has moved."""
     at, tau = node.s_at + 4 * child, (time_ns - since_ns) * 1e-9
     before_x, before_y = real[at], real[at + 1]
     if link.brought == PREDICTED:
@@ -63,11 +62,13 @@ def bring(
         real[at + 2] += ax * tau
         real[at + 3] += ay * tau
     else:
-        then_x, then_y, then_vx, then_vy, _, _ = desired(run, table, max(0, since_ns) * 1e-9)
-        real[at] += now_x - then_x
-        real[at + 1] += now_y - then_y
-        real[at + 2] += now_vx - then_vx
-        real[at + 3] += now_vy - then_vy
+        now = _reference(run, table, real, whole, time_ns)
+        x, y, vx, vy = real[now], real[now + 1], real[now + 2], real[now + 3]
+        then = _reference(run, table, real, whole, max(0, since_ns))
+        real[at] += x - real[then]
+        real[at + 1] += y - real[then + 1]
+        real[at + 2] += vx - real[then + 2]
+        real[at + 3] += vy - real[then + 3]
     if not run.avoidance:
         return
     x, y = real[at] - before_x, real[at + 1] - before_y
@@ -77,6 +78,18 @@ def bring(
             for value in range(0, size, 2):
                 real[node.state_at + here + value] += x
                 real[node.state_at + here + value + 1] += y
+
+
+@fused
+def _reference(run: Any, table: Any, real: Any, whole: Any, time_ns: int) -> int:
+    """Returns where in `real` the reference and its velocity at an instant are.  They are kept, by the tick of the instant,
+    because robots say their states at the same instants."""
+    slot = int(time_ns * run.per_tick) & (REFERENCES - 1)
+    place = int(run.references_at + 4 * slot)
+    if whole[run.references_ns_at + slot] != time_ns:
+        whole[run.references_ns_at + slot] = time_ns
+        real[place], real[place + 1], real[place + 2], real[place + 3], _, _ = desired(run, table, time_ns * 1e-9)
+    return place
 
 
 @fused

@@ -213,10 +213,11 @@ class ModelMaker:
         kind, numbers = self._trajectory()
         law = plan.law.made
         sliding = isinstance(law, TerminalSliding)
+        tick_ns = gcd(*[one.period_ns for one in plan.formation])
         return {
             "duration_ns": plan.duration_ns,
             **dict(zip(("sooner_ns", "earlier_ns", "last_ns"), late_sixths_ns(plan), strict=True)),
-            "tick_ns": gcd(*[one.period_ns for one in plan.formation]),
+            "tick_ns": tick_ns,
             "common_ns": lcm(*[robot.period_ns for robot in plan.robots]),
             "avoidance": avoidance.enabled,
             "law": r.SLIDING if sliding else r.INTEGRAL if isinstance(law, Integral) else r.LINEAR,
@@ -232,6 +233,8 @@ class ModelMaker:
             "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),
             "closest_at": pools.whole(4),
+            "references_at": pools.real(4 * r.REFERENCES),
+            "references_ns_at": pools.whole(r.REFERENCES),
             "avoidance_radius": avoidance.avoidance_radius,
             "sensing_radius": avoidance.sensing_radius,
             "force_limit": avoidance.force_limit,
@@ -240,6 +243,7 @@ class ModelMaker:
             "beta": law.beta if sliding else 0.0,
             "kappa": law.kappa if sliding else 0.0,
             "ahead": plan.lead * plan.root.period_ns * 1e-9,
+            "per_tick": 1 / tick_ns,
         }
 
     def _trajectory(self) -> tuple[int, list[Any]]:

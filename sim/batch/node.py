@@ -7,7 +7,7 @@ from echelon.sim.batch.late_states import bring, note_commands
 from echelon.sim.batch.law import desired, own_law, to_children, to_shape
 from echelon.sim.batch.memory import copy, copy_four
 from echelon.sim.batch.potential import add_pair_forces
-from echelon.sim.batch.records import STAMP, WITH_REFERENCE
+from echelon.sim.batch.records import STAMP
 from echelon.sim.batch.streams import hear, heard_ns, read_age_ns, room, say, take_up
 
 
@@ -20,19 +20,17 @@ def gather(
     this period."""
     count = node.count
     time_ns = due_ns
+    for child in range(count):
+        take_up(links[index[node.links_at + child]], index, whole)
     if node.when_heard:
-        for child in range(count):
-            take_up(links[index[node.links_at + child]], index, whole)
         time_ns, last_ns = max(due_ns, whole[node.acted_at]), _last_ns(node, run, due_ns)
         for child in range(count):
             time_ns = heard_ns(links[index[node.links_at + child]], whole, time_ns, last_ns)
     whole[node.acted_at] = time_ns
     complete = 1
-    x = y = vx = vy = 0.0
-    is_known = False  # the reference at `time_ns`
     for child in range(count):
         link = links[index[node.links_at + child]]
-        said = hear(link, run, index, real, whole, time_ns)
+        said = hear(link, run, real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -45,10 +43,7 @@ def gather(
             if link.odd_clocks:
                 since_ns = time_ns - read_age_ns(link, time_ns, since_ns)
             if since_ns != time_ns:
-                if link.brought == WITH_REFERENCE and not is_known:
-                    x, y, vx, vy, _, _ = desired(run, table, time_ns * 1e-9)
-                    is_known = True
-                bring(node, run, link, table, index, real, whole, child, said, time_ns, since_ns, x, y, vx, vy)
+                bring(node, run, link, table, index, real, whole, child, said, time_ns, since_ns)
     whole[node.has_state_at] = complete
     if complete:
         _transform(node, run, table, real, time_ns)
@@ -105,14 +100,15 @@ def steer(
 ) -> None:  # fmt: skip
     """Takes the parent's reference in the period from `due_ns` on; sends REFERENCE and COMMAND to the children."""
     time_ns = whole[node.acted_at]
-    if node.when_heard and node.link >= 0:
+    if node.link >= 0:
         take_up(links[node.link], index, whole)
-        time_ns = heard_ns(links[node.link], whole, time_ns, _last_ns(node, run, due_ns))
-        whole[node.acted_at] = time_ns
+        if node.when_heard:
+            time_ns = heard_ns(links[node.link], whole, time_ns, _last_ns(node, run, due_ns))
+            whole[node.acted_at] = time_ns
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
-        said = hear(links[node.link], run, index, real, whole, time_ns)
+        said = hear(links[node.link], run, real, whole, time_ns)
         if said < 0:
             complete = 0
         else:

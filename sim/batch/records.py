@@ -26,12 +26,12 @@ RUN: Final = _record(
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
     # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and their velocities; places of robots
     # before, and their order (potential); square of the smallest distance; the pair and its instant, then the number of
-    # violations; a hash table (ages)
-    "due_at places_at rates_at before_at order_at distance_at closest_at slots_at "
+    # violations; references of `REFERENCES` instants, and these (late_states); a hash table (ages)
+    "due_at places_at rates_at before_at order_at distance_at closest_at references_at references_ns_at slots_at "
     # from when on amplitudes are summed up: the last three sixths of the run [ns]
     "sooner_ns earlier_ns last_ns",
-    # `ahead`: how far the feed-forward is led [s]
-    "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead",
+    # `ahead`: how far the feed-forward is led [s]; ticks in a nanosecond
+    "avoidance_radius sensing_radius force_limit floor gamma beta kappa ahead per_tick",
 )
 ROBOT: Final = _record(
     # `at`: its state in `real`, `place`: its position; `command`: place of its acceleration in its leader's COMMAND; whether
@@ -100,6 +100,9 @@ AS_THEY_ARE, WITH_REFERENCE, EXTRAPOLATED, PREDICTED = 0, 1, 2, 3
 COMMAND_REALS: Final = 6
 """Of one child: acceleration, and velocity and displacement since run time 0 due to earlier commands"""
 
+REFERENCES: Final = 64
+"""Instants of which the reference is kept"""
+
 # Places in a robot's part of `real`.  Its position is among those of all robots.
 THETA, V, OMEGA, COS, SIN, TAU_RIGHT, TAU_LEFT, HELD_S = range(8)
 """... torques last held, and how long they were held [s]"""
@@ -117,22 +120,24 @@ DRAWN, TABLE, TABLE_Z, BY_NUMBER, BY_TIME = range(5)
 
 # Places in a link's part of `whole`.
 TAKEN, IN_USE, STAMP, IS_NULL, LAST, LOST, DELIVERED, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX = range(12)
-NEXT, NEWEST, OLDEST, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 22)
-F_OWN, F_LOSS, F_COPY, F_BURST = 22, 26, 30, 34
+NEXT, HEARD, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 21)
+"""... when the next message arrives that is newer than the one in use, when the receiver looked last, latest arrival so far"""
+F_OWN, F_LOSS, F_COPY, F_BURST = 21, 25, 29, 33
 """Draws of two messages"""
-AGED, AGES, AGE_P50, AGE_P95, AGE_P99 = range(38, 43)
+AGED, AGES, AGE_P50, AGE_P95, AGE_P99 = range(37, 42)
 """Uses of messages older than the instant; number of their different ages once they are counted one by one, -1 if there are too
 many; percentiles (ages)"""
 LISTED: Final = 2048
 """Length of a list of ages"""
 SLOTS: Final = 2048
 """Size of the hash table of ages"""
-LINK_WHOLES: Final = 43
-"""After these come the arrivals of the messages in flight [ns], then those of their second copies"""
+LINK_WHOLES: Final = 42
+"""After these come the arrivals of the newest messages [ns], `FAR` for those that are lost or arrive after the end of the run,
+then those of their second copies"""
 COUNTS: Final = (TAKEN, DELIVERED, LOST, DUPLICATES, USED, HELD, AGE_SUM, AGE_MAX, AGE_P50, AGE_P95, AGE_P99)
 """What of these is a result"""
 GONE: Final = -1
-"""Arrival of a message that was delivered or lost"""
+"""The delay of a message that is lost"""
 FAR: Final = 1 << 62
 """An instant that never comes [ns]"""
 

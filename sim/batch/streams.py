@@ -3,8 +3,8 @@
 
 from typing import Any
 
-from echelon.sim.batch.ages import note_age
-from echelon.sim.batch.compiled import compiled
+from echelon.sim.batch.ages import find_percentiles, note_age
+from echelon.sim.batch.compiled import apart, compiled
 from echelon.sim.batch.fates import fates, rounded
 from echelon.sim.batch.memory import copy
 from echelon.sim.batch.records import (
@@ -14,6 +14,7 @@ from echelon.sim.batch.records import (
     DUPLICATES,
     FAR,
     GONE,
+    HEARD,
     HELD,
     IN_USE,
     IS_NULL,
@@ -21,9 +22,7 @@ from echelon.sim.batch.records import (
     LATEST,
     LINK_WHOLES,
     LOST,
-    NEWEST,
     NEXT,
-    OLDEST,
     STAMP,
     TAKEN,
     USED,
@@ -47,9 +46,9 @@ def say(stream: Any, whole: Any, time_ns: int, is_null: int) -> None:
 
 
 @compiled
-def hear(link: Any, run: Any, index: Any, real: Any, whole: Any, time_ns: int) -> int:
+def hear(link: Any, run: Any, real: Any, whole: Any, time_ns: int) -> int:
     """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
-    use.  Must be called with ascending instants."""
+    use.  Must be called with ascending instants, after `take_up`."""
     marks = link.marks_at
     used = whole[marks + USED]
     if link.prompt:
@@ -64,9 +63,9 @@ def hear(link: Any, run: Any, index: Any, real: Any, whole: Any, time_ns: int) -
             whole[marks + STAMP] = sent_ns
         place = link.stream_at + slot * link.length
     else:
-        take_up(link, index, whole)
-        receive(link, whole, time_ns)
-        _use(link, real, whole)
+        whole[marks + HEARD] = time_ns
+        if whole[marks + NEXT] <= time_ns:
+            _receive(link, real, whole, time_ns)
         number, place, last = whole[marks + IN_USE], link.at, whole[marks + LAST]
         sent_ns, is_null = whole[marks + STAMP], whole[marks + IS_NULL]
         whole[marks + LAST] = number
@@ -95,81 +94,61 @@ def read_age_ns(link: Any, time_ns: int, sent_ns: int) -> int:
 
 @compiled
 def take_up(link: Any, index: Any, whole: Any) -> None:
-    """Draws what becomes of the messages that were sent since the last call.  Those that arrive after the run are not kept, so
-    that a heavy tail costs nothing."""
+    """Draws what becomes of the messages that were sent since the last call, and counts all that arrive before the end of the
+    run (`finish`).  A message that arrives later is on its way for ever, so a heavy tail costs nothing."""
     if link.prompt:
         return
     marks = link.marks_at
-    number, arrivals, copies = whole[marks + TAKEN], marks + LINK_WHOLES, marks + LINK_WHOLES + link.mask + 1
+    number, arrivals = whole[marks + TAKEN], marks + LINK_WHOLES
     while number < whole[link.stream_marks_at]:
-        sent_ns, slot = whole[link.stream_marks_at + 1 + 2 * (number & link.mask)], number & link.mask
+        slot = number & link.mask
+        sent_ns = whole[link.stream_marks_at + 1 + 2 * slot]
         first, second = fates(link, number, sent_ns, index, whole)
-        whole[arrivals + slot] = whole[copies + slot] = GONE
+        arrives_ns = copy_arrives_ns = FAR
         if first == GONE:
             whole[marks + LOST] += 1
         else:
-            whole[arrivals + slot] = max(sent_ns + first, whole[marks + LATEST]) if link.fifo else sent_ns + first
-            whole[marks + NEXT] = min(whole[marks + NEXT], whole[arrivals + slot])
-        if second != GONE:
-            whole[copies + slot] = max(sent_ns + second, whole[marks + LATEST]) if link.fifo else sent_ns + second
-        if first != GONE:
-            whole[marks + LATEST] = whole[arrivals + slot]
-        if whole[arrivals + slot] > link.end_ns:
-            whole[arrivals + slot] = GONE
-        if whole[copies + slot] > link.end_ns:
-            whole[copies + slot] = GONE
+            arrives_ns = _arrival_ns(link, sent_ns + first, whole[marks + LATEST])
+            if second != GONE:
+                copy_arrives_ns = _arrival_ns(link, sent_ns + second, whole[marks + LATEST])
+            if link.fifo:
+                whole[marks + LATEST] = arrives_ns
+            whole[marks + NEXT] = min(whole[marks + NEXT], arrives_ns)
+            whole[marks + DELIVERED] += arrives_ns < FAR
+        whole[arrivals + slot] = arrives_ns
+        if link.duplicates > 0.0:
+            whole[arrivals + link.mask + 1 + slot] = copy_arrives_ns
+            whole[marks + DUPLICATES] += copy_arrives_ns < FAR
         number += 1
     whole[marks + TAKEN] = number
 
 
 @compiled
-def receive(link: Any, whole: Any, time_ns: int) -> None:
-    """Counts the messages that have arrived by `time_ns`, and notes the newest of them."""
-    marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
-    if link.prompt or whole[marks + NEXT] > time_ns:
-        return
-    next_ns = FAR
-    taken = whole[marks + TAKEN]
-    oldest = max(whole[marks + OLDEST], taken - link.mask - 1)  # what is older has arrived or is lost
-    for number in range(oldest, taken):
-        arrival = arrivals + (number & link.mask)
-        if link.duplicates > 0.0:
-            copy = arrival + link.mask + 1
-            if whole[copy] != GONE and whole[copy] <= time_ns:
-                whole[copy] = GONE
-                whole[marks + DUPLICATES] += 1
-            elif whole[copy] != GONE:
-                next_ns = min(next_ns, whole[copy])
-        if whole[arrival] == GONE:
-            continue
-        if whole[arrival] <= time_ns:
-            whole[arrival] = GONE
-            whole[marks + DELIVERED] += 1
-            whole[marks + NEWEST] = max(whole[marks + NEWEST], number)
-        else:
-            next_ns = min(next_ns, whole[arrival])
-    while (
-        oldest < taken
-        and whole[arrivals + (oldest & link.mask)] == GONE
-        and whole[arrivals + link.mask + 1 + (oldest & link.mask)] == GONE
-    ):
-        oldest += 1
-    whole[marks + OLDEST] = oldest
-    whole[marks + NEXT] = next_ns
+def _arrival_ns(link: Any, arrives_ns: int, latest_ns: int) -> int:
+    """Returns when a message arrives that takes its delay until `arrives_ns`; `latest_ns`: the latest arrival before."""
+    if link.fifo:
+        arrives_ns = max(arrives_ns, latest_ns)
+    return FAR if arrives_ns > link.end_ns else arrives_ns
 
 
 @compiled
-def _use(link: Any, real: Any, whole: Any) -> None:
-    """Takes the newest message that has arrived into use."""
-    marks, newest = link.marks_at, whole[link.marks_at + NEWEST]
-    if newest <= whole[marks + IN_USE]:
-        return
-    mark = link.stream_marks_at + 1 + 2 * (newest & link.mask)
+def _receive(link: Any, real: Any, whole: Any, time_ns: int) -> None:
+    """Takes the newest message that has arrived into use, and notes when the next newer one arrives."""
+    marks, arrivals, taken = link.marks_at, link.marks_at + LINK_WHOLES, whole[link.marks_at + TAKEN]
+    newest, next_ns = whole[marks + IN_USE], FAR
+    for number in range(max(newest + 1, taken - link.mask - 1), taken):
+        arrives_ns = whole[arrivals + (number & link.mask)]
+        if arrives_ns <= time_ns:
+            newest, next_ns = number, FAR
+        else:
+            next_ns = min(next_ns, arrives_ns)
+    whole[marks + NEXT] = next_ns
+    slot = newest & link.mask
+    mark, source = link.stream_marks_at + 1 + 2 * slot, link.stream_at + slot * link.length
     whole[marks + IN_USE] = newest
     whole[marks + STAMP] = whole[mark]
     whole[marks + IS_NULL] = whole[mark + 1]
     if whole[mark + 1] == 0:
-        source = link.stream_at + (newest & link.mask) * link.length
         copy(real, source + link.first_1, link.at + link.first_1, link.size_1)
         copy(real, source + link.first_2, link.at + link.first_2, link.size_2)
         copy(real, source + link.first_3, link.at + link.first_3, link.size_3)
@@ -182,10 +161,7 @@ def heard_ns(link: Any, whole: Any, at_ns: int, last_ns: int) -> int:
     marks = link.marks_at
     if link.prompt or whole[marks + TAKEN] - 1 <= whole[marks + IN_USE]:
         return at_ns
-    receive(link, whole, at_ns)
-    if whole[marks + NEWEST] > whole[marks + IN_USE]:
-        return at_ns
-    return max(at_ns, min(last_ns, _next_arrival_ns(link, whole)))
+    return max(at_ns, min(last_ns, int(whole[marks + NEXT])))
 
 
 @compiled
@@ -193,7 +169,7 @@ def change_ns(link: Any, whole: Any, time_ns: int) -> int:
     """Returns the first instant after `time_ns` at which something newer arrives, or at which the message in use becomes too
     old."""
     marks = link.marks_at
-    change = _next_arrival_ns(link, whole)
+    change = whole[marks + NEXT]
     if link.timeout_ns < FAR and whole[marks + IN_USE] >= 0 and whole[marks + IS_NULL] == 0:
         expires_ns = _expires_ns(link, whole[marks + STAMP])
         if expires_ns > time_ns:
@@ -216,13 +192,15 @@ def _expires_ns(link: Any, sent_ns: int) -> int:
     return int(expires_ns)
 
 
-@compiled
-def _next_arrival_ns(link: Any, whole: Any) -> int:
-    """Returns when the next message arrives that is newer than the one in use; `FAR` if there is none."""
-    marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
-    taken, found = whole[marks + TAKEN], FAR
-    for number in range(max(whole[marks + IN_USE] + 1, taken - link.mask - 1), taken):
-        arrival = whole[arrivals + (number & link.mask)]
-        if arrival != GONE:
-            found = min(found, arrival)
-    return int(found)
+@apart
+def finish(link: Any, run: Any, whole: Any) -> None:
+    """Takes back what was counted and had not arrived when the receiver looked last; finds the percentiles of the ages."""
+    if not link.prompt:
+        marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
+        heard_ns, taken = whole[marks + HEARD], whole[marks + TAKEN]
+        for number in range(max(0, taken - link.mask - 1), taken):
+            arrival = arrivals + (number & link.mask)
+            whole[marks + DELIVERED] -= heard_ns < whole[arrival] < FAR
+            if link.duplicates > 0.0:
+                whole[marks + DUPLICATES] -= heard_ns < whole[arrival + link.mask + 1] < FAR
+    find_percentiles(link, run, whole)

@@ -3,7 +3,6 @@
 from math import cos, inf, isfinite, sin
 from typing import Any, Final
 
-from echelon.sim.batch.ages import find_percentiles
 from echelon.sim.batch.compiled import compiled, is_kept
 from echelon.sim.batch.late_states import begin_commands
 from echelon.sim.batch.measures import measure
@@ -20,13 +19,13 @@ from echelon.sim.batch.records import (
     LAST,
     M_FINITE,
     M_LAST,
-    NEWEST,
     NEXT,
     OMEGA,
     P_LEFT,
     P_PEAK,
     P_RIGHT,
     P_SATURATED,
+    REFERENCES,
     S_LATE,
     S_LEFT,
     S_PEAK,
@@ -37,7 +36,7 @@ from echelon.sim.batch.records import (
     THETA,
     V,
 )
-from echelon.sim.batch.streams import change_ns, hear, room, say
+from echelon.sim.batch.streams import change_ns, finish, hear, room, say, take_up
 
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
@@ -116,8 +115,9 @@ def _add_squares(blocks: Any, real: Any, sums: Any, instant: int) -> None:
 def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, due_ns: int) -> None:
     """Moves a robot through the period from `due_ns` on, with the accelerations that arrive in it."""
     now_ns, end_ns = due_ns, due_ns + robot.period_ns
+    take_up(link, index, whole)
     while now_ns < end_ns:
-        said, until_ns = hear(link, run, index, real, whole, now_ns), end_ns
+        said, until_ns = hear(link, run, real, whole, now_ns), end_ns
         if robot.on_arrival:
             change = change_ns(link, whole, now_ns)
             until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
@@ -136,6 +136,8 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
         real[place] = 0.0
     for place in range(len(whole)):
         whole[place] = 0
+    for place in range(REFERENCES):
+        whole[run.references_ns_at + place] = -1
     for number in range(len(robots)):
         robot = robots[number]
         real[robot.place], real[robot.place + 1] = robot.x, robot.y
@@ -145,7 +147,7 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
         real[robot.at + SIN] = sin(robot.heading)
     for number in range(len(links)):
         marks = links[number].marks_at
-        whole[marks + IN_USE] = whole[marks + NEWEST] = whole[marks + LAST] = -1
+        whole[marks + IN_USE] = whole[marks + LAST] = -1
         whole[marks + NEXT] = FAR
         for word in range(4):
             whole[marks + KEY_0 + word] = keys[number, word]
@@ -207,7 +209,7 @@ def many_runs(
     for number in range(first, last):
         lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)], sums)
         for at in range(len(model.links)):
-            find_percentiles(model.links[at], model.run[0], whole)
+            finish(model.links[at], model.run[0], whole)
         for place in range(len(kept_reals)):
             reals[number, place] = real[kept_reals[place]]
         for place in range(len(kept_wholes)):

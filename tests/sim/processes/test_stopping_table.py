@@ -267,9 +267,9 @@ def attempt(folder: Path, clock: str, cells: Sequence[Cell], machine: Lateness) 
             reader.join()
             heard_no_end = last.hit in ("KILL", "STOP", "STOP 2", "STOP 20")
             if not (heard_no_end and last.who == "bridge"):
-                assert until(lambda: not ear.enabled and not ear.commands_torque)
+                assert until(lambda: not ear.enabled and not ear.commands_torque, 30)
             if not (heard_no_end and last.who == "drives"):
-                assert until(lambda: not ear.torque)
+                assert until(lambda: not ear.torque, 30)
             assert not run.has_said("Traceback")
             assert run.has_said(last.said) or not last.said
             if last.out.code is None and last.who != "supervisor":

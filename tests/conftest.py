@@ -14,6 +14,7 @@ from hypothesis import settings
 TESTS: Final = Path(__file__).parent
 LONG: Final = (
     "test_vcan.py",
+    "sim/processes/test_stopping_table.py",
     "sim/processes/test_stopping.py",
     "cli/test_cli.py",
     "sim/processes/test_supervisor.py",

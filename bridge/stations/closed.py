@@ -13,8 +13,9 @@ from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
 from echelon.bridge.reports import BridgeProgress, CanReport, WheelsReport, stopped_text
 from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
-from echelon.bridge.stations.guarding import intrusions, open_guarded
+from echelon.bridge.stations.guarding import intrusions, look, open_guarded
 from echelon.bridge.stations.rail import Rail, on_bus
+from echelon.bridge.stations.waiting import FLOOD
 from echelon.bridge.timing.buses import bus_report, scheduled
 from echelon.bridge.timing.fit import plan_fit
 from echelon.errors import PartRunError
@@ -46,6 +47,7 @@ class ClosedBridge(Bridge):
         self.urls = [bus.url for bus in self.buses]
         self.url = ", ".join(self.urls) or "nowhere"
         self.rail = Rail(self.buses)
+        self._paired = paired
         for bus, name in enumerate(dbc_names(plan)):
             write_new(folder / name, plan_dbc(plan, bus))
         self._names = [bus.name for bus in plan.can.buses]
@@ -99,15 +101,19 @@ class ClosedBridge(Bridge):
         self.rail.stopping.set()
 
     def close(self) -> None:
-        """Closes log and buses."""
+        """Closes log and buses, after a last look at what others sent."""
+        look(self.buses, self.rail.spoken, FLOOD)
         self._log.close()
         for bus in self.buses:
             bus.close()
 
     def progress(self) -> BridgeProgress:
         """Returns the present state, for a live table."""
-        for one in self.buses:
-            one.guard.look_outside()
+        if self._paired:  # the rail reads the frames
+            for one in self.buses:
+                one.guard.look_outside()
+        else:
+            look(self.buses, self.rail.spoken, FLOOD)
         return BridgeProgress(
             url=self.url,
             load=max(bus.load for bus in self.role.buses),

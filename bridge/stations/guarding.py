@@ -5,6 +5,7 @@ from collections.abc import Container, Sequence
 from echelon.bridge.can.bus import Bus, Received, open_bus
 from echelon.bridge.protocols.registry import run_identifiers
 from echelon.bridge.reports import IntrusionReport
+from echelon.bridge.stations.waiting import drained
 from echelon.plan.plan import Plan
 
 
@@ -27,6 +28,16 @@ def check_sender(bus: Bus, spoken: Container[int], received: Received) -> None:
     A remote frame or an empty one asks for a frame, as anybody may."""
     if received.can_id in spoken and received.data:
         bus.guard.count(received.sender, received.can_id)
+
+
+def look(buses: Sequence[Bus], spoken: Sequence[Container[int]], most: int) -> None:
+    """Counts what others have sent with the identifiers that this process sends, `spoken` on each bus; uses none of it.
+
+    It reads up to `most` frames from each bus."""
+    for bus, own in zip(buses, spoken, strict=True):
+        for received in drained(bus, most):
+            check_sender(bus, own, received)
+        bus.guard.look_outside()
 
 
 def intrusions(plan: Plan, buses: Sequence[Bus]) -> tuple[IntrusionReport, ...]:

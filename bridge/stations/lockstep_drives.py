@@ -7,9 +7,9 @@ from typing import Final
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.reports import BridgeProgress, DrivesReport
 from echelon.bridge.roles.drive_bank import DriveBank
-from echelon.bridge.stations.guarding import intrusions, open_guarded
+from echelon.bridge.stations.guarding import check_sender, intrusions, open_guarded
 from echelon.bridge.stations.rail import Rail, on_bus
-from echelon.bridge.stations.waiting import drained
+from echelon.bridge.stations.waiting import FLOOD, drained
 from echelon.plan.plan import Plan
 from echelon.role import Stage
 
@@ -29,6 +29,8 @@ class LockstepDrives:
         self.index = self._bank.index
         self._plan, self._buses = plan, open_guarded(plan, urls)
         self._rail = Rail(self._buses)
+        self._of_run: DrivesReport | None = None
+        """The drives' report before `stop`"""
         self._rest_ns = min(2 * max(robot.drive.watchdog_ns for robot in plan.robots), LONGEST_REST_NS)
         self.stages: tuple[Stage, ...] = on_bus(self._bank.stages, self._rail, is_bridge=False)
 
@@ -41,10 +43,12 @@ class LockstepDrives:
 
         So who listens to the bus hears that the wheels have no torque, however the run ends.  Of watchdogs beyond half of
         `LONGEST_REST_NS` that is so only where the bridge has stopped the drives, as it does unless it was killed."""
+        self._of_run = self._bank.report()
         time_ns = self._bank.next_ns
         frames = []
         for number, bus in enumerate(self._buses):
-            for received in drained(bus):
+            for received in drained(bus, FLOOD):
+                check_sender(bus, self._rail.spoken[number], received)
                 frame = Frame(received.can_id, received.data, received.remote)
                 frames += self._bank.receive(time_ns, number, frame)
         for step in range(1, STEPS + 1):
@@ -57,8 +61,9 @@ class LockstepDrives:
         return BridgeProgress(note=self._rail.waiting)
 
     def report(self) -> DrivesReport:
-        """Returns the report of all drives."""
-        return replace(self._bank.report(), foreign=self._rail.foreign, intrusions=intrusions(self._plan, self._buses))
+        """Returns the report of the run, without what the drives do in `stop`; but what others sent then counts."""
+        report = self._of_run or self._bank.report()
+        return replace(report, foreign=self._rail.foreign, intrusions=intrusions(self._plan, self._buses))
 
     def close(self) -> None:
         """Closes the buses."""

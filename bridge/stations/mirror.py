@@ -16,8 +16,8 @@ from echelon.bridge.reports import BridgeProgress, BusReport, CanReport, stopped
 from echelon.bridge.roles.torque_mirror import TorqueMirror
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.closed import send_all
-from echelon.bridge.stations.guarding import check_sender, intrusions, open_guarded
-from echelon.bridge.stations.waiting import AT_ONCE, RunClock, drained
+from echelon.bridge.stations.guarding import intrusions, look, open_guarded
+from echelon.bridge.stations.waiting import AT_ONCE, FLOOD, RunClock
 from echelon.bridge.timing.bus_load import bus_load
 from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
@@ -28,8 +28,6 @@ from echelon.plan.plan import Plan
 TAU_RIGHT: Final = STATE_FIELDS.index("tau_right")
 TAU_LEFT: Final = STATE_FIELDS.index("tau_left")
 SATURATED: Final = STATE_FIELDS.index("saturated")
-FLOOD: Final = 100 * AT_ONCE
-"""In virtual time, how many frames are read from a bus at once"""
 
 
 class MirrorBridge(Bridge):
@@ -154,10 +152,7 @@ class MirrorBridge(Bridge):
         """Counts what others send with identifiers of this run.  The bridge uses none of it.
 
         In virtual time it reads on behind a flood, where the frames that matter may be."""
-        for bus, spoken in zip(self._buses, self._spoken, strict=True):
-            for received in drained(bus, FLOOD if self.clock is None else AT_ONCE):
-                check_sender(bus, spoken, received)
-            bus.guard.look_outside()
+        look(self._buses, self._spoken, FLOOD if self.clock is None else AT_ONCE)
 
     def report(self) -> CanReport:
         """Returns the report of the run up to the last look at the buses (`progress`, `close`), with the load that the frames

@@ -35,6 +35,8 @@ class Rail:
 
     def __init__(self, buses: Sequence[Bus]) -> None:
         self.buses = buses
+        self.spoken: list[set[int]] = [set() for _ in buses]
+        """For each bus, the identifiers of the frames that this station has put on it"""
         self.foreign = 0
         """Number of frames that no process of this run had announced"""
         self.waiting = ""
@@ -44,6 +46,7 @@ class Rail:
     def put(self, frames: Sequence[TimedFrame]) -> None:
         """Puts frames on their buses; waits while a bus accepts none.  Raises SystemExit if `stopping` is set meanwhile."""
         for time_ns, bus, _, (can_id, data, remote) in frames:
+            self.spoken[bus].add(can_id)
             while not self.buses[bus].send(can_id, data, time_ns, remote):
                 self.waiting = f"{self.buses[bus].url} takes no frames: {self.buses[bus].error}"
                 if self.stopping.wait(RETRY_S):

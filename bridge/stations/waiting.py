@@ -19,6 +19,8 @@ PROGRESS_NS: Final = 200_000_000
 """How often a process reports its progress and reads its orders; the longest sleep of `wait_for`."""
 AT_ONCE: Final = 256
 """The largest number of frames that are read from a bus at once."""
+FLOOD: Final = 100 * AT_ONCE
+"""The same in virtual time, which waits: the frames that matter may be behind a flood"""
 
 
 class Mail:

@@ -20,9 +20,9 @@ from echelon.bridge.reports import BridgeProgress, CanReport, TorqueTimes
 from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.closed import ClosedBridge
-from echelon.bridge.stations.guarding import check_sender
+from echelon.bridge.stations.guarding import check_sender, look
 from echelon.bridge.stations.paced_bus import PacedBus
-from echelon.bridge.stations.waiting import Mail, RunClock, drained
+from echelon.bridge.stations.waiting import AT_ONCE, Mail, RunClock, drained
 from echelon.bridge.timing.bus_load import BitCount
 from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
@@ -215,7 +215,8 @@ class WallBridge(Bridge):
             raise PartRunError(failure)
 
     def close(self) -> None:
-        """Closes log and buses."""
+        """Closes log and buses, after a last look at what others sent."""
+        look(self._closed.buses, [bus.spoken for bus in self._buses], AT_ONCE)
         self._closed.close()
 
     def progress(self) -> BridgeProgress:

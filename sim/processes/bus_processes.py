@@ -32,7 +32,7 @@ from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.session import Session
 from echelon.runtime.wire import encode, join, watch_key
 from echelon.sim.processes.contract import Body, ProcessSpec, finish, hear_finish, meet, tell
-from echelon.sim.processes.to_supervisor import Failed, PartFailed, Report, Said, Waiting
+from echelon.sim.processes.to_supervisor import Failed, PartFailed, Said, Waiting
 from echelon.sim.processes.wall_bus_processes import made, run_wall_bridge, run_wall_drives, run_wall_referee
 from echelon.sim.processes.watch import STOP, Watch
 from echelon.sim.processes.watchers import HIGH_WATER, Reception
@@ -139,7 +139,6 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch
     teller = threading.Thread(target=_tell, args=(station, say_if_room, done), name="progress", daemon=True)
     teller.start()
     failure: Failed | PartFailed | None = None
-    report: Report | None = None
     try:
         runner.run(lambda time_ns, sources: say_if_room(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off, but the counts so far are still reported
@@ -149,8 +148,6 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch
     except PartRunError as error:
         failure = PartFailed(str(error))
     finally:
-        if spec.kind == "drives":
-            report = station.report()  # of the run, without what ends it
         try:
             stop()  # before anything that may wait for others
         except PartRunError as error:
@@ -163,7 +160,7 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch
         say(failure)
         raise SystemExit(1)
     signal.signal(STOP, lambda number, frame: os._exit(0))
-    finish(spec, control, runner.counts, runner.mailbox.counts(), report or station.report(), runner.refusals)
+    finish(spec, control, runner.counts, runner.mailbox.counts(), station.report(), runner.refusals)
 
 
 def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], done: threading.Event) -> None:

@@ -121,14 +121,14 @@ def _finish(
         while child.done is None and child.alive:
             serve(0.05)
             waited_s, stopped = time.monotonic() - begun_s, child.state() == "stopped"
+            if not failure and waited_s > STALL_REPORT_S:
+                say(f"waits for {child.name} to finish ({child.state()}{child.runs()})")
             if stopped and not continued and (failure or waited_s > GRACE_S):
                 failure = failure or _lost(child)
                 child.signal(signal.SIGCONT)
                 begun_s, continued = time.monotonic(), True
             elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
                 break
-            if not failure and waited_s > STALL_REPORT_S:
-                say(f"waits for {child.name} to finish ({child.state()}{child.runs()})")
     except (RunError, DivergedError, OSError) as error:
         failure = failure or str(error)
     return failure or (_lost(child) if child.done is None else None)

@@ -1,5 +1,6 @@
 """The process `observers`: it receives copies of all messages of a run and gives them on to those who may only read."""
 
+import time
 from multiprocessing.connection import Connection
 
 from echelon.messages import Channel, Message
@@ -39,6 +40,9 @@ def run_observers(spec: ProcessSpec, session: Session, control: Connection, watc
         reception.begin(meet(spec, session, control))
         while (order := hear_finish(control)) is None:
             give(reception.take(PROGRESS_S / 2))
+            now_s = time.monotonic()
+            watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
+        watch.pulse.rest()
         for messages in reception.drain(order.messages):
             give(messages)
         finish(spec, control, refusals=reception.refusals)  # before closing, which waits for observers that stand still

@@ -6,7 +6,7 @@ the wheels for good; where the drives recover, for `RECOVER_S`.  Others are name
 `standstill` fails the verdict.
 
 In virtual time every member waits for the messages of others, so one process that stands still stops all.  A member that waits
-says so every now and then; a process that says nothing is the one that everyone waits for.
+says so every now and then; a member that says nothing is the one that everyone waits for, or a watcher without a pulse.
 """
 
 import time
@@ -94,9 +94,13 @@ class StallWatch:
     def check(self, now_s: float) -> None:
         """Notes in the progress that the run stalls, or that it goes on; call it a few times a second while it runs.
 
+        A run stalls, too, if a watcher stands still, though members go on until there is no room for more messages.
+
         `now_s` is on the monotonic clock [s].  Raises StallError after `stall_timeout_s` without progress."""
         at = (self._progress.time_ns, max((child.waiting_ns for child in self._children), default=-1))
-        if at != self._moved_at:
+        if at != self._moved_at and not self._watchers_late_by(
+            STANDSTILL_S, now_s
+        ):  # members may run ahead of a watcher
             self._moved_at, self._moved_s = at, now_s
             if self._warned:
                 self._warned, self._progress.note = False, "goes on"
@@ -110,6 +114,11 @@ class StallWatch:
         if still_s > self._stall_timeout_s:
             raise StallError(still_s, self._who_is_waited_for(now_s))
 
+    def _watchers_late_by(self, late_s: float, now_s: float) -> list[Child]:
+        """Returns the watchers that are late by some time, by their pulses."""
+        then_ns = round((now_s - late_s) * 1e9)
+        return [child for child in self._children if not child.is_member and child.pulse.overdue_ns(then_ns)]
+
     def _stands_at_ns(self, now_s: float) -> int:
         """Returns the instant [ns] at which the run stands: the first one at which a member waits.  What is recorded may be
         older, for copies of messages come in batches."""
@@ -119,10 +128,10 @@ class StallWatch:
     def _who_is_waited_for(self, now_s: float) -> str:
         """Returns in words which processes everyone waits for: the silent ones, or else who waits for whom.
 
-        A silent watcher comes first: members may be silent only because it does not take their messages.  One that is waited
-        for, and waits for nobody, works or hangs, even if a thread of it still speaks."""
+        A watcher that stands still, by its pulse, comes first: members may be silent only because it does not take their
+        messages.  One that is waited for, and waits for nobody, works or hangs, even if a thread of it still speaks."""
         quiet = [child for child in self._children if now_s - child.heard_s > SILENT_S]
-        silent = [child for child in quiet if not child.is_member]
+        silent = self._watchers_late_by(SILENT_S, now_s)
         silent = silent or [child for child in quiet if child.is_member and child.done is None]
         awaited = {source for child in self._children if _waits(child, now_s) for source in child.waiting_for}
         silent = silent or [

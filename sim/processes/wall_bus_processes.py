@@ -125,14 +125,18 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection, w
     buses = _open_buses(spec.can_urls)
     # processes wait for a processor, so a frame is late only by a time that a drive's watchdog would almost notice
     referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
-    clock = RunClock(meet(spec, session, control))
+    watch.pulse.from_ns = meet(spec, session, control)
+    clock = RunClock(watch.pulse.from_ns)
     while hear_finish(control) is None:
+        now_ns = time.monotonic_ns()
+        watch.pulse.beat(now_ns, now_ns + PROGRESS_NS)
         wait_for([control], LISTEN_NS)  # not for each frame: the kernel stamps them
         for number, bus in enumerate(buses):
             for received in drained(bus):
                 at_ns = clock.of(received.time_ns)
                 if at_ns <= spec.plan.duration_ns:  # after the end of a run, bridge and drives stop one after the other
                     referee.observe(at_ns, number, Frame(received.can_id, received.data, received.remote))
+    watch.pulse.rest()
     referee.finish(min(clock.now(), spec.plan.duration_ns))
     # robots must not be blamed for what the referee did not hear: then can.log is judged instead
     deaf = any(bus.missed for bus in buses)

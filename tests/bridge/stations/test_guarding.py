@@ -8,13 +8,17 @@ import pytest
 from echelon.bridge.can.bus import Received, open_bus
 from echelon.bridge.can.bus_url import free_multicast_url
 from echelon.bridge.can.guard import KEPT, NODE, OTHERS, Guard
-from echelon.bridge.frame_message import TimedFrame
+from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame
+from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.registry import run_identifiers
 from echelon.bridge.roles.commander import Commander
 from echelon.bridge.roles.drive_bank import DriveBank
+from echelon.bridge.stations.closed import ClosedBridge
 from echelon.bridge.stations.guarding import check_sender, intrusions, open_guarded
+from echelon.bridge.stations.lockstep_drives import LockstepDrives
 from echelon.bridge.stations.mirror import MirrorBridge
 from echelon.bridge.stations.waiting import AT_ONCE
+from echelon.bridge.stations.wall_bridge import WallBridge
 from support.runs import plan_of
 
 PROTOCOLS = ["native", "odrive", "cia402"]
@@ -107,3 +111,74 @@ def test_a_flood_of_senders_takes_no_room() -> None:
     found = list(guard.intrusions)
     assert len(found) == KEPT + 1
     assert found[0] == (OTHERS, 1, 10_000 - KEPT)
+
+
+BUSES = pytest.mark.parametrize("kind", ["udp_multicast", "virtual"])
+"""A bus whose frames have the addresses of their senders, and one whose frames have none, as on SocketCAN"""
+
+
+def url_of(kind: str, name: str) -> str:
+    """Returns the URL of a bus that nobody uses yet."""
+    return free_multicast_url() if kind == "udp_multicast" else f"virtual:{name}"
+
+
+@BUSES
+def test_drives_in_lockstep_name_who_spoke_for_them_while_they_stopped(kind: str) -> None:
+    """What the bridge sends then is no intrusion, nor is what it had sent before and they have not taken yet."""
+    plan = plan_of("lab", "can.path=closed", "claims=[]")
+    drives = LockstepDrives(plan, [url_of(kind, "drives-stop")])
+    url = drives._buses[0].url
+    with open_bus(url) as stranger, open_bus(url) as listener:
+        drives.stages[0].run(drives.stages[0].first_ns, ())
+        sent = []
+        while (heard := listener.recv(0.0)) is not None:
+            sent.append(heard.can_id)
+        for _ in range(2 * AT_ONCE):
+            stranger.send(0x100, bytes(8))
+        stranger.send(sent[0], b"x")
+        while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
+            pass
+        assert heard is not None  # so all have come
+        drives.stop()
+        drives.close()
+    (one,) = drives.report().intrusions
+    assert (one.id, one.frames) == (f"{sent[0]:03X}", 1)
+    assert (one.sender == NODE) is (kind == "virtual")
+
+
+@BUSES
+@pytest.mark.parametrize("paired", [True, False])
+def test_a_bridge_in_virtual_time_looks_a_last_time_before_it_closes_its_buses(
+    kind: str, paired: bool, tmp_path: Path
+) -> None:
+    """What drives have still sent is no intrusion."""
+    plan = plan_of("lab", "can.path=closed", "claims=[]")
+    bridge = ClosedBridge(plan, [url_of(kind, f"bridge-{paired}")], tmp_path, paired=paired)
+    with open_bus(bridge.url) as stranger, open_bus(bridge.url) as listener:
+        bridge.rail.put([TimedFrame(0, 0, BRIDGE_NODE, Frame(0x100, bytes(8)))])
+        stranger.send(0x180, bytes(8))
+        stranger.send(0x100, b"x")
+        while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
+            pass
+        assert heard is not None  # so both have come
+        bridge.stop()
+        bridge.close()
+    (one,) = bridge.report().intrusions
+    assert (one.id, one.frames) == ("100", 1)
+    assert (one.sender == NODE) is (kind == "virtual")
+
+
+def test_a_bridge_on_a_wall_clock_looks_a_last_time_before_it_closes_its_buses(tmp_path: Path) -> None:
+    plan = plan_of("lab", "can.path=closed", "claims=[]")
+    bridge = WallBridge(plan, [free_multicast_url()], tmp_path, lambda payload: None, None)
+    with open_bus(bridge.url) as stranger, open_bus(bridge.url) as listener:
+        while (heard := listener.recv(0.0)) is None:
+            bridge.serve()
+        bridge.stop()
+        stranger.send(heard.can_id, b"x")
+        while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
+            pass
+        assert heard is not None  # so it has come
+        bridge.close()
+    (one,) = bridge.report().intrusions
+    assert (one.id, one.frames) == (f"{heard.can_id:03X}", 1)

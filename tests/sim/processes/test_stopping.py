@@ -1,6 +1,6 @@
 """However a run ends, the wheels stop: zero torque and disabled drives, heard by a listener of its own on the bus.
 
-The listener is python-can's, in this process.  It shares no code with what is tested.
+What each process of a run does at each signal, and when it is killed or stands still, is in `test_stopping_table`.
 """
 
 import os
@@ -10,13 +10,8 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from subprocess import Popen
 
 import can
 import pytest
@@ -27,162 +22,14 @@ from echelon.sim.processes.outcome import Progress
 from echelon.sim.processes.socket_folder import remove
 from echelon.sim.processes.stalls import BREAK_S, RECOVER_S
 from echelon.sim.processes.supervisor import Supervisor
-from support.runs import (
-    echelon,
-    kill_session,
-    pid_of,
-    reasons,
-    session_members,
-    start_echelon,
-    summary_of,
-    trace_of,
-    until,
-)
+from support.late import lateness
+from support.runs import echelon, kill_session, reasons, session_members, start_echelon, summary_of, trace_of, until
+from support.stopped import GROUP, REPORT, SCENARIO, WATCHDOG_S, ended, listening, running, whom
 
-GROUP = "239.74.163.7"
-COMMAND, FEEDBACK = 0x100, 0x180
-WATCHDOG_S = 1.0
 SLACK_S = 3.0
 """How late processes may be on a busy machine"""
-NAMED_S = 2.0
-"""After so long whoever stands still on a wall clock has been named"""
-SCENARIO = f"""
-name = "stopped"
-duration = 1000.0
-robot = {{ mass = 4.0, inertia = 0.12, wheel_radius = 0.05, arm = 0.15, offset = 0.1 }}
-law = {{ epsilon = [0.5], lead = 0.5 }}
-trajectory = {{ kind = "circle", radius = 3.0, rate = 0.3 }}
-formation.robots = {{ solo = {{ start = [0, 1.5] }} }}
-can = {{ path = "closed", watchdog = {WATCHDOG_S} }}
-"""
-
-
-@dataclass
-class Ear:
-    """Hears the frames of the robot `solo` on a bus: native frames, torques as two whole numbers."""
-
-    port: int
-    commands: list[tuple[float, bytes]] = field(default_factory=list)
-    """Commands, each with the instant of `time.time` at which the kernel had it"""
-    turning_s: float = 0.0
-    """When a drive last reported torque"""
-    torque: bool = False
-    """Whether the last report was of torque"""
-    reports: int = 0
-
-    @property
-    def enabled(self) -> bool:
-        """Whether the last command enables the drives."""
-        return bool(self.commands) and self.commands[-1][1][4] != 0
-
-    @property
-    def has_driven(self) -> bool:
-        """Whether a command enabled the drives and was of torque."""
-        return any(data[4] and data[:4] != bytes(4) for _, data in list(self.commands))
-
-    @property
-    def commands_torque(self) -> bool:
-        """Whether the last command is of torque."""
-        return bool(self.commands) and self.commands[-1][1][:4] != bytes(4)
-
-    def hear(self, bus: can.BusABC, done: threading.Event) -> None:
-        """Listens until `done`."""
-        while not done.is_set():
-            message = bus.recv(0.05)
-            if message is None:
-                continue
-            if message.arbitration_id == COMMAND:
-                self.commands.append((message.timestamp, bytes(message.data)))
-            elif message.arbitration_id == FEEDBACK:
-                self.reports += 1
-                self.torque = bytes(message.data[:4]) != bytes(4)
-                if self.torque:
-                    self.turning_s = message.timestamp
-
-
-@contextmanager
-def listening() -> Iterator[Ear]:
-    """A context with an ear on a bus that nobody uses yet."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        port = probe.getsockname()[1]
-    ear, done = Ear(port), threading.Event()
-    try:
-        bus = can.Bus(interface="udp_multicast", channel=GROUP, port=port, hop_limit=0, fd=False, ignore_config=True)
-    except (OSError, can.CanError) as error:
-        pytest.skip(f"no multicast: {error}")
-    thread = threading.Thread(target=ear.hear, args=(bus, done))
-    thread.start()
-    try:
-        yield ear
-    finally:
-        done.set()
-        thread.join()
-        bus.shutdown()
-
-
-@contextmanager
-def running(folder: Path, *options: str, text: str = SCENARIO) -> Iterator[tuple[Popen[str], Ear]]:
-    """A run in a session of its own, whose drives report torque already; what is left of it is killed afterwards."""
-    scenario = folder / "stopped.toml"
-    scenario.write_text(text)
-    with listening() as ear:
-        command = start_echelon(
-            *("run", scenario, "--can", f"udp_multicast:{GROUP}:{ear.port}", "--quiet", "--out", folder / "run"),
-            *(("--no-report",) if REPORT not in options else ()),
-            *(option for option in options if option != REPORT),
-        )
-        try:
-            assert until(lambda: ear.has_driven or command.poll() is not None)
-            assert ear.has_driven, command.communicate()
-            yield command, ear
-        finally:
-            kill_session(command.pid)
-            command.communicate()
-
-
-def ended(command: Popen[str], timeout_s: float = 600) -> tuple[int, str]:
-    """Waits for the end of a run and of all its processes; returns its exit code and standard error."""
-    _, err = command.communicate(timeout=timeout_s)
-    assert until(lambda: not session_members(command.pid)), session_members(command.pid)
-    return command.returncode, err
-
-
-def whom(command: Popen[str], who: str) -> int:
-    """Returns the process with a role."""
-    return command.pid if who == "supervisor" else pid_of(who, session_members(command.pid))
-
-
 WALL, VIRTUAL = ("--clock", "wall"), ("--clock", "virtual")
-REPORT = "--report"
 CLOCKS = pytest.mark.parametrize("clock", [WALL, VIRTUAL], ids=["wall", "virtual"])
-
-
-@CLOCKS
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda number: number.name)
-@pytest.mark.parametrize("to", ["supervisor", "group", "group twice", "bridge", "solo"])
-def test_a_signal_ends_the_run_in_order_and_the_last_command_disables(
-    to: str, number: signal.Signals, clock: tuple[str, str], tmp_path: Path
-) -> None:
-    with running(tmp_path, *clock) as (command, ear):
-        at_s = time.time()
-        if to.startswith("group"):
-            os.killpg(command.pid, number)
-            if to == "group twice":
-                os.kill(command.pid, number)
-        else:
-            os.kill(whom(command, to), number)
-        assert until(lambda: not ear.enabled)
-        disabled_s = next(at for at, data in reversed(ear.commands) if data[4] == 0)
-        code, err = ended(command)
-        assert code == 3, err
-        assert not ear.enabled
-        assert not ear.commands_torque
-        assert disabled_s - at_s < SLACK_S + WATCHDOG_S
-        assert not ear.torque
-        assert ("interrupted" in err) if to not in ("bridge", "solo") else (f"{to} was asked to end" in err)
-        assert "Traceback" not in err
-        assert summary_of(tmp_path / "run")["instants"] > 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda number: number.name)
@@ -292,80 +139,6 @@ def test_a_folder_that_is_too_deep_for_sockets_is_one_line(tmp_path: Path) -> No
     assert "TMPDIR" in done.stderr
 
 
-@CLOCKS
-@pytest.mark.parametrize("who", ["supervisor", "solo", "coordinator", "bridge", "drives", "recorder"])
-def test_whatever_is_killed_the_wheels_stop(who: str, clock: tuple[str, str], tmp_path: Path) -> None:
-    with running(tmp_path, *clock) as (command, ear):
-        at_s = time.time()
-        os.kill(whom(command, who), signal.SIGKILL)
-        code, err = ended(command)
-        if who == "supervisor":
-            assert code == -signal.SIGKILL
-        else:
-            assert code == 3
-            assert f"lost {'robot ' if who == 'solo' else ''}{who}" in err
-        if who != "bridge":
-            assert not ear.enabled
-            assert not ear.commands_torque
-        if who != "drives":
-            assert not ear.torque
-        assert ear.turning_s - at_s < WATCHDOG_S + SLACK_S
-
-
-@pytest.mark.slow
-@CLOCKS
-@pytest.mark.parametrize(
-    ("who", "seconds"),
-    [
-        pytest.param(who, seconds, id=f"{who}-{'for_ever' if seconds is None else f'{seconds:g}s'}")
-        for who in ("supervisor", "solo", "coordinator", "bridge", "drives", "recorder")
-        for seconds in (0.2, 2.0, 20.0, None)
-        if seconds != 20.0 or who in ("solo", "bridge")  # the others are in `make chaos`
-    ],
-)
-def test_whoever_stands_still_the_wheels_have_no_torque_without_reason(
-    who: str, seconds: float | None, clock: tuple[str, str], tmp_path: Path
-) -> None:
-    """A bridge or drives that stand still on a wall clock end the run, others their part in it.  In virtual time all wait."""
-    with running(tmp_path, *clock, "--stall-timeout", "6") as (command, ear):
-        pid = whom(command, who)
-        os.kill(pid, signal.SIGSTOP)
-        at_s = time.time()
-        long = seconds is None or seconds > 1.0
-        breaks = long and who in ("bridge", "drives") if clock == WALL else seconds is None and who != "supervisor"
-        breaks |= clock == VIRTUAL and seconds == 20.0 and who != "supervisor"  # longer than the stall timeout
-        if clock == WALL and long and who in ("solo", "coordinator", "bridge"):
-            assert until(lambda: not ear.torque or time.time() - at_s > (seconds or 20.0))
-            assert ear.turning_s - at_s < WATCHDOG_S + SLACK_S
-        if not breaks:
-            if seconds is None and clock == WALL:
-                assert until(lambda: time.time() - at_s > NAMED_S)
-            if seconds is not None:
-                assert until(lambda: time.time() - at_s > seconds, seconds + 5)
-                os.kill(pid, signal.SIGCONT)
-                commands = len(ear.commands)
-                assert until(lambda: len(ear.commands) > commands), "the run goes on"
-            if seconds is None and who == "supervisor":
-                os.killpg(command.pid, signal.SIGTERM)
-                assert until(lambda: not ear.enabled)  # the bridge needs nobody for that
-                os.kill(pid, signal.SIGKILL)
-            else:
-                os.kill(command.pid, signal.SIGTERM)
-        code, err = ended(command, 90)
-        assert code in (3, -signal.SIGKILL), err
-        if breaks:
-            assert f"{who} stands still" in err if clock == WALL else f"everyone waits for {who}" in err
-        elif who != "supervisor":
-            assert "interrupted" in err
-        if clock == WALL and long and who not in ("supervisor", "recorder"):
-            assert f"{who} stands still" in err
-        if who != "bridge" or not breaks:
-            assert not ear.enabled
-            assert not ear.commands_torque
-        if who != "drives" or not breaks:
-            assert not ear.torque
-
-
 def test_a_bridge_that_stands_still_on_a_wall_clock_is_blamed_at_once(tmp_path: Path) -> None:
     with running(tmp_path, *WALL) as (command, ear):
         pid = whom(command, "bridge")
@@ -410,6 +183,43 @@ def test_a_member_that_stood_still_for_a_while_is_named_and_fails_the_verdict(wh
         assert check["text"].startswith(f"stood still: {who} for ")
         assert check["measured"] > 1.5
         assert not ear.enabled
+
+
+SLOW = """
+import time
+from echelon.agents.plant import Plant, paper_step
+
+class Slow(Plant):
+    def step(self, robot, state, tau_right, tau_left, h):
+        if (state.x, state.y) != robot.start:  # the trial before a run does not leave the start
+            time.sleep(0.3)
+        return paper_step(robot)(state, tau_right, tau_left, h)
+"""
+
+
+def test_a_member_that_is_slow_is_named_and_its_torques_are_not_used_when_they_are_old(tmp_path: Path) -> None:
+    """It needs 0.3 s for each period of 0.1 s, so its torques are two thirds of the run's time old."""
+    (tmp_path / "slow.py").write_text(SLOW)
+    text = SCENARIO.replace("start = [0, 1.5]", 'start = [0, 1.5], model = "slow.py:Slow"')
+    text = text.replace("duration = 1000.0", "duration = 1000.0\nperiods = { acceleration = 0.1, torque = 0.1 }")
+    with lateness(tmp_path / "late") as machine, running(tmp_path, *WALL, text=text) as (command, ear):
+        assert until(lambda: not ear.torque and not ear.commands_torque)
+        (first_s, *_) = (at for at, data in ear.commands if data[4] and data[:4] != bytes(4))
+        late_s = 2 * sum(machine.of(first_s, ear.turning_s))
+        assert ear.turning_s - first_s < 1.5 * WATCHDOG_S + 0.5 + late_s
+        line = command.stderr.readline() if command.stderr is not None else ""
+        named = re.match(
+            r"robot solo stands still, for ([0-9.]+) s from t = ([0-9.]+) s on \(process [0-9]+, [a-z]+, which", line
+        )
+        assert named, line
+        assert float(named[1]) < 1.0 + late_s
+        reports = ear.reports
+        assert until(lambda: ear.reports > reports + 20)
+        assert not ear.torque, "nothing newer has come"
+        os.kill(command.pid, signal.SIGTERM)
+        code, _ = ended(command)
+        assert code == 3
+        assert any(reason.startswith("stood still: solo for ") for reason in reasons(summary_of(tmp_path / "run")))
 
 
 @pytest.mark.parametrize("into_the_run", [False, True])

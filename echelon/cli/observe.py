@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,11 +50,10 @@ def observe(options: ObserveOptions) -> int:
             continue
         values = message.values.tolist()
         if options.json:
-            named: Any = (
-                dict(zip(fields[message.channel], values, strict=True)) if message.channel in fields else values
-            )
+            known = [value if isfinite(value) else None for value in values]
+            named: Any = dict(zip(fields[message.channel], known, strict=True)) if message.channel in fields else known
             line = {"t": message.time_ns / 1e9, "from": names[message.source], "channel": channel, "values": named}
-            print(json.dumps(line), flush=True)
+            print(json.dumps(line, allow_nan=False), flush=True)
         else:
             shown = " ".join(f"{value:.4g}" for value in values) or "(null)"
             print(f"{message.time_ns / 1e9:>10.4f} s  {names[message.source]:<12} {channel:<12} {shown}", flush=True)

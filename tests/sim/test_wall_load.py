@@ -84,3 +84,26 @@ def test_a_run_that_is_too_much_says_so_and_is_thinned_without_a_finding(tmp_pat
     (check,) = [each for each in summary["verdict"]["checks"] if each["name"] == "recording"]
     assert "thinned by rule" in check["text"] or check["outcome"] == "failed"
     assert "messages left out by rule" in done.stdout
+
+
+def test_27_robots_are_warned_of_and_recorded_by_rule_and_all_are_controlled(tmp_path: Path) -> None:
+    """Also on a machine that is busy: then stages are late and the run fails, but what is recorded and sent is counted."""
+    scenario, out = tmp_path / "many.toml", tmp_path / "run"
+    scenario.write_text(many(9).replace("duration = 0.5", "duration = 3.0"))
+    plan = parse(scenario.read_text(), "many.toml")[1]
+    load = wall_load(plan, False)
+    done = echelon("run", scenario, "--clock", "wall", "--can", "none", "--no-report", "--keep-going", "--out", out)
+    summary = json.loads((out / "summary.json").read_text())
+    run = summary["run"]
+    assert run["failure"] is None, done.stderr
+    assert ("warning: on a wall clock 38 processes take about" in done.stderr) == (load.share > BUSY)
+    assert " running " not in done.stderr.partition("warning: ")[0] or load.share <= BUSY  # it comes before the run
+    assert run["recorded_every"] == (load.every_ns / 1e9 if load.every_ns else None)
+    assert (run["thinned"] > 0) == (load.every_ns > 0)
+    assert done.returncode == {"HOLDS": 0, "HEALTHY": 0, "FAILS": 1}[summary["verdict"]["word"]]
+    (check,) = [each for each in summary["verdict"]["checks"] if each["name"] == "recording"]
+    assert check["outcome"] == "passed", check
+    periods = plan.duration_ns // plan.robots[0].period_ns
+    sent = [link["sent"] for link in summary["links"] if link["channel"] == "state"]
+    assert len(sent) == 27
+    assert min(sent) >= periods  # no period was left out, whatever was recorded

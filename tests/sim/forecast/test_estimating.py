@@ -8,9 +8,10 @@ import pytest
 from echelon.controller.prediction.blackout import effect
 from echelon.controller.prediction.largest_delay import largest_extra_delay
 from echelon.controller.prediction.linear_run import edges_of, later, ruled_links
-from echelon.controller.prediction.mean_square import Losses
+from echelon.controller.prediction.mean_square import Losses, mean_square
 from echelon.messages import Channel
-from echelon.sim.forecast.estimating import Estimates
+from echelon.sim.forecast.estimating import HALVINGS, Estimates
+from echelon.sim.forecast.link_rows import LOSSES, LinkRows
 from echelon.sim.forecast.own_links import OwnLinks, calm
 from support.runs import plan_of
 
@@ -101,6 +102,23 @@ def test_the_largest_delay_by_runs_is_the_exact_one() -> None:
     assert found.low is not None
     assert found.low <= exact * 1.02
     assert found.high >= exact * 0.98
+
+
+@pytest.mark.parametrize(("channel", "rare"), [(Channel.STATE, False), (Channel.GROUP_STATE, True)])
+def test_the_largest_loss_by_runs_is_the_exact_one_or_a_little_more(channel: Channel, rare: bool) -> None:
+    """It is within the interval of the runs; only where rare runs count that these do not hold, links bear less."""
+    plan = plan_of("lab", "duration=20", "periods.acceleration=0.05", "periods.torque=0.05")
+    exact = mean_square(plan, channel).loss
+    assert exact is not None
+    found = LinkRows(plan, plan, Estimates(plan, 16), lambda *said: None)._loss_by_runs(edges_of(plan, channel))
+    assert found.low is not None
+    assert found.value is not None
+    assert found.high is not None
+    assert found.low <= exact or rare
+    assert exact <= found.high
+    below, above = (max(loss for loss in LOSSES if loss < exact), min(loss for loss in LOSSES if loss > exact))
+    assert exact - (above - below) / 2**HALVINGS <= found.value < above
+    assert found.high - found.low < 0.05
 
 
 @pytest.mark.parametrize(

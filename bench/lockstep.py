@@ -27,6 +27,7 @@ from bench.tree import ROLES
 
 PEERS: Final = {
     "zenoh": ("bench.peers.zenoh_session", "run", "eclipse-zenoh"),
+    "zenoh-secrets": ("bench.peers.zenoh_session", "run_with_secrets", "eclipse-zenoh"),
     "pyzmq": ("bench.peers.pyzmq_ipc", "run", "pyzmq"),
     "pyzmq-batch": ("bench.peers.pyzmq_ipc", "run_batch", "pyzmq"),
     "pipes": ("bench.peers.pipes", "run", None),

@@ -23,7 +23,7 @@ from echelon.sim.processes.supervisor import Supervisor
 from support.runs import ROOT
 
 
-@pytest.mark.parametrize("peer", ["zenoh", "pipes"])
+@pytest.mark.parametrize("peer", ["zenoh", "zenoh-secrets", "pipes"])
 def test_a_peer_ends_where_the_exchange_ends(peer: str) -> None:
     # A process of its own: roles are forked, which a process that has used Zenoh must not do.
     command = [sys.executable, "-m", "bench.lockstep", "--peers", peer, "--ticks", "50", "--repeat", "1", "--json"]

@@ -55,10 +55,19 @@ class _Handler:
                 self._done.set()
 
 
-def run(ticks: int, folder: Path) -> None:
+def run_with_secrets(ticks: int, folder: Path) -> None:
+    """Runs the exchange as the processes of a run do: nobody else is let in, and each publishes its own keys only."""
+    run(ticks, folder, secrets=True)
+
+
+def run(ticks: int, folder: Path, secrets: bool = False) -> None:
     """Runs the exchange."""
+    from echelon.runtime.credentials import Credentials, new_identity
     from echelon.runtime.session import Session, loopback_endpoints
 
+    own = {
+        role: new_identity(role.name, [f"echelon/*/{role.name}/*", f"echelon/*/@alive/{role.name}"]) for role in ROLES
+    }
     endpoints = dict(zip((COORDINATOR, *LEADERS), loopback_endpoints(1 + len(LEADERS)), strict=True))
 
     def connect(role: Role, folder: Path) -> Iterator[Ports]:
@@ -75,8 +84,17 @@ def run(ticks: int, folder: Path) -> None:
             below = list(LEADERS)
             sends, receives = ["reference"], {"group": below}
         ports = _Handler({channel: len(sources) for channel, sources in receives.items()})
+        credentials = Credentials(
+            own[role],
+            (f"{run}/**", f"{run}/@alive/*"),
+            guests=tuple(own[one] for one in below),
+            hosts=tuple(own[one] for one in above),
+        )
         with Session(
-            listen=[endpoints[role]] if below else [], connect=[endpoints[one] for one in above], lockstep=True
+            listen=[endpoints[role]] if below else [],
+            connect=[endpoints[one] for one in above],
+            lockstep=True,
+            credentials=credentials if secrets else None,
         ) as session:
             for channel, sources in receives.items():
                 keys = [f"{run}/{one.name}/{channel}" for one in sources]

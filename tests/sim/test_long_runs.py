@@ -1,4 +1,4 @@
-"""Long runs take no more memory than short ones: what comes is written, and summary and report read it back in pieces."""
+"""Long runs: no process of a run grows, and a recording of an hour takes no more memory than a short one."""
 
 import os
 import time

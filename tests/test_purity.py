@@ -9,7 +9,8 @@ from support.runs import ROOT
 
 CALLS = {"open", "print", "input", "eval", "exec"}
 METHODS = {"read_text", "write_text", "read_bytes", "write_bytes", "mkdir", "unlink", "rename", "iterdir", "glob"}
-GLOBAL = ("np.random.", "os.", "sys.")
+METHODS |= {"open", "exists", "is_file", "is_dir", "stat", "touch", "tofile"}
+GLOBAL = ("np.random.", "np.load", "np.save", "np.fromfile", "np.genfromtxt", "np.memmap", "os.", "sys.")
 EXCEPTIONS = {
     ("echelon/planning/loading.py", "path.read_text"),  # a scenario is read where its mistakes are explained
     ("sim/results/rendering.py", "write_text"),
@@ -55,4 +56,5 @@ def test_what_is_impure_is_seen() -> None:
         "np.random.normal",
         "np.random.default_rng",
     ]
+    assert list(impure_calls("Path('x').open()\nnp.savetxt('x', y)")) == ["Path('x').open", "np.savetxt"]
     assert list(impure_calls("x.reads()\nnp.random.default_rng(1).normal()\nrandom.normal()\nself.open_bus()")) == []

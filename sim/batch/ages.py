@@ -1,18 +1,17 @@
 """Ages of the messages that a receiver uses: their percentiles (echelon.runtime.ages, as arrays).
 
-The first `LISTED` ages above 0 are a list in a link's part of `whole`.  When it is full it is sorted, and each age has a number
-of uses.  With more than `EXACT` different ages all are counted in bins: by their eight leading bits, which are the first bits
-of the age as a float.  Random delays mostly come to this as soon as the list is full; then nothing is sorted.
+Each age above 0 is counted in a hash table, in a link's part of `whole`: its slots are pairs of an age and the number of its
+uses.  With more than `EXACT` different ages all are counted in bins: by their eight leading bits, which are the first bits of
+the age as a float.
 """
 
-from math import ceil
 from typing import Any, Final
 
 import numpy as np
 
 from echelon.runtime.ages import EXACT
 from echelon.sim.batch.compiled import apart, compiled
-from echelon.sim.batch.records import AGE_MAX, AGE_P50, AGED, AGES, LISTED, SLOTS, USED
+from echelon.sim.batch.records import AGE_MAX, AGE_P50, AGED, AGES, USED
 
 _DROPPED: Final = 45
 """Bits of a float after the first eight of its fraction, the leading one included"""
@@ -36,136 +35,85 @@ def middle_of(number: int) -> int:
 
 
 @compiled
-def note_age(link: Any, run: Any, whole: Any, age_ns: int) -> None:
+def note_age(link: Any, whole: Any, age_ns: int) -> None:
     """Counts an age above 0."""
-    marks = link.marks_at
-    count = whole[marks + AGED]
-    whole[marks + AGED] = count + 1
-    if count < LISTED:
-        whole[link.ages_at + count] = age_ns
-    elif whole[marks + AGES] < 0:
-        whole[link.bins_at + bin_of(age_ns)] += 1
-    else:
-        _note_further(link, run, whole, age_ns)
-
-
-@compiled
-def _decide(link: Any, run: Any, count: int, whole: Any) -> None:
-    """Puts the ages of a list into bins if there are too many different ones."""
-    ages, marks = link.ages_at, link.marks_at
-    if _differ(run.slots_at, ages, count, whole):
-        for place in range(count):
-            whole[link.bins_at + bin_of(whole[ages + place])] += 1
-        whole[marks + AGES] = -1
-
-
-@apart
-def _note_further(link: Any, run: Any, whole: Any, age_ns: int) -> None:
-    """Counts an age that came after a full list."""
-    ages, uses, marks = link.ages_at, link.uses_at, link.marks_at
-    if whole[marks + AGES] == 0:
-        _decide(link, run, LISTED, whole)
-        if whole[marks + AGES] == 0:
-            _sort(ages, LISTED, whole)
-            whole[marks + AGES] = _merge(ages, uses, whole)
+    marks, table = link.marks_at, link.ages_at
+    whole[marks + AGED] += 1
     if whole[marks + AGES] < 0:
         whole[link.bins_at + bin_of(age_ns)] += 1
         return
-    count = whole[marks + AGES]
-    low, high = 0, count
-    while low < high:
-        middle = (low + high) // 2
-        if whole[ages + middle] < age_ns:
-            low = middle + 1
+    slot = (age_ns + (age_ns >> 7) + (age_ns >> 17)) & link.ages_mask
+    while whole[table + 2 * slot] != age_ns:
+        if whole[table + 2 * slot] == 0:
+            if whole[marks + AGES] == EXACT:
+                _into_bins(link, whole)
+                whole[link.bins_at + bin_of(age_ns)] += 1
+                return
+            whole[marks + AGES] += 1
+            whole[table + 2 * slot] = age_ns
         else:
-            high = middle
-    if low < count and whole[ages + low] == age_ns:
-        whole[uses + low] += 1
-    elif count < EXACT:
-        for place in range(count, low, -1):
-            whole[ages + place] = whole[ages + place - 1]
-            whole[uses + place] = whole[uses + place - 1]
-        whole[ages + low] = age_ns
-        whole[uses + low] = 1
-        whole[marks + AGES] = count + 1
-    else:
-        for place in range(count):
-            whole[link.bins_at + bin_of(whole[ages + place])] += whole[uses + place]
-        whole[link.bins_at + bin_of(age_ns)] += 1
-        whole[marks + AGES] = -1
-
-
-@compiled
-def _differ(slots: int, ages: int, count: int, whole: Any) -> bool:
-    """Returns whether more than `EXACT` of the ages of a list are different, by a hash table."""
-    different = 0
-    for place in range(SLOTS):
-        whole[slots + place] = 0
-    for number in range(count):
-        age_ns = whole[ages + number]
-        place = (age_ns + (age_ns >> 7) + (age_ns >> 17)) & (SLOTS - 1)
-        while whole[slots + place] != age_ns:
-            if whole[slots + place] == 0:
-                different += 1
-                if different > EXACT:
-                    return True
-                whole[slots + place] = age_ns
-            else:
-                place = (place + 1) & (SLOTS - 1)
-    return False
-
-
-@compiled
-def _merge(ages: int, uses: int, whole: Any) -> int:
-    """Writes each age of a full, sorted list once, and the number of its uses; returns their number."""
-    count = 0
-    for place in range(LISTED):
-        if count > 0 and whole[ages + count - 1] == whole[ages + place]:
-            whole[uses + count - 1] += 1
-        else:
-            whole[ages + count] = whole[ages + place]
-            whole[uses + count] = 1
-            count += 1
-    return count
+            slot = (slot + 1) & link.ages_mask
+    whole[table + 2 * slot + 1] += 1
 
 
 @apart
-def find_percentiles(link: Any, run: Any, whole: Any) -> None:
+def _into_bins(link: Any, whole: Any) -> None:
+    """Counts in bins what is in the table of a link, and from now on."""
+    for place in range(link.bins):
+        whole[link.bins_at + place] = 0
+    for slot in range(link.ages_mask + 1):
+        age_ns = whole[link.ages_at + 2 * slot]
+        if age_ns > 0:
+            whole[link.bins_at + bin_of(age_ns)] += whole[link.ages_at + 2 * slot + 1]
+    whole[link.marks_at + AGES] = -1
+
+
+@apart
+def find_percentiles(link: Any, whole: Any) -> None:
     """Finds the ages that 50, 95 and 99 % of the uses do not exceed."""
-    marks = link.marks_at
+    marks, table = link.marks_at, link.ages_at
     count, total = whole[marks + AGED], whole[marks + USED]
     if count == 0:
         return
-    if EXACT < count <= LISTED:
-        _decide(link, run, count, whole)
-    zeros, above, at = total - count, 0, whole[marks + AGES] - 1
-    rough = at == -2
+    zeros, above = total - count, 0
+    rough = whole[marks + AGES] < 0
     if rough:
         at = bin_of(whole[marks + AGE_MAX])
-    elif count <= LISTED:
-        _sort(link.ages_at, count, whole)
+    else:
+        at = _listed(link, whole) - 1
+        _sort(table, at + 1, whole)
     for number in range(2, -1, -1):
         enough = (0.5 if number == 0 else (0.95 if number == 1 else 0.99)) * total
         age_ns = 0
         if zeros < enough:
-            if count <= LISTED and not rough:
-                age_ns = whole[link.ages_at + max(0, int(ceil(enough)) - zeros - 1)]  # noqa: RUF046
-            else:
-                counts = link.bins_at if rough else link.uses_at
-                while total - above - whole[counts + at] >= enough:
-                    above += whole[counts + at]
-                    at -= 1
-                age_ns = middle_of(at) if rough else whole[link.ages_at + at]
+            counts, width = (link.bins_at, 1) if rough else (table + 1, 2)
+            while total - above - whole[counts + width * at] >= enough:
+                above += whole[counts + width * at]
+                at -= 1
+            age_ns = middle_of(at) if rough else whole[table + 2 * at]
         whole[marks + AGE_P50 + number] = min(age_ns, whole[marks + AGE_MAX])
 
 
 @compiled
+def _listed(link: Any, whole: Any) -> int:
+    """Moves the pairs in use to the front of the table; returns their number."""
+    table, count = link.ages_at, 0
+    for slot in range(link.ages_mask + 1):
+        age_ns, uses = whole[table + 2 * slot], whole[table + 2 * slot + 1]
+        if age_ns > 0:
+            whole[table + 2 * count], whole[table + 2 * count + 1] = age_ns, uses
+            count += 1
+    return count
+
+
+@compiled
 def _sort(first: int, count: int, whole: Any) -> None:
-    """Sorts ages."""
+    """Sorts pairs of an age and the number of its uses by the age."""
     for gap in _GAPS:
-        for place in range(first + gap, first + count):
-            age_ns, free = whole[place], place
-            while free >= first + gap and whole[free - gap] > age_ns:
-                whole[free] = whole[free - gap]
+        for place in range(gap, count):
+            age_ns, uses, free = whole[first + 2 * place], whole[first + 2 * place + 1], place
+            while free >= gap and whole[first + 2 * (free - gap)] > age_ns:
+                whole[first + 2 * free] = whole[first + 2 * (free - gap)]
+                whole[first + 2 * free + 1] = whole[first + 2 * (free - gap) + 1]
                 free -= gap
-            whole[free] = age_ns
+            whole[first + 2 * free], whole[first + 2 * free + 1] = age_ns, uses

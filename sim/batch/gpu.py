@@ -100,7 +100,7 @@ def make_kernel(**options: Any) -> Any:
             trace = traces[min(number, len(traces) - 1)]
             lost_ns[number] = one_run(model, keys[number], my_real, my_whole, trace, sums)
             for at in range(len(model.links)):
-                finish(model.links[at], model.run[0], my_whole)
+                finish(model.links[at], my_whole)
             for place in range(len(kept_reals)):
                 reals[place, number] = my_real[kept_reals[place]]
             for place in range(len(kept_wholes)):

@@ -104,11 +104,12 @@ class LinkMaker:
         most = duration_ns // receiver.period_ns + 3 * (duration_ns // link.period_ns) + 4
         if link.prompt and not acts_late and receiver.period_ns % link.period_ns == 0:
             most = 0  # it is always new
-        many = most > EXACT
+        # Twice as many slots as can be needed: an age is found at once.
+        slots = 1 << max(1, 2 * min(most, EXACT) - 1).bit_length()
         return {
-            "ages_at": pools.whole(min(most, r.LISTED)),
-            "uses_at": pools.whole(EXACT if many else 0),
-            "bins_at": pools.whole(duration_ns.bit_length() << 7 if many else 0),
+            "ages_at": pools.whole(2 * slots),
+            "ages_mask": slots - 1,
+            "bins": duration_ns.bit_length() << 7 if most > EXACT else 0,
         }
 
     def _parts(self, at: int) -> list[tuple[int, int]]:

@@ -53,7 +53,9 @@ class ModelMaker:
         # What is seldom touched comes last: what is touched at each instant lies close together.
         for link, record in zip(plan.links, links, strict=True):
             record |= self.of_links.ages(link)
-        run["slots_at"] = pools.whole(r.SLOTS)
+        run["zeros"] = pools.wholes
+        for record in links:
+            record["bins_at"] = pools.whole(record["bins"])
         table, index = pools.arrays()
         return r.Model(
             records_of(r.RUN, [run]),

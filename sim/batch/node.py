@@ -30,7 +30,7 @@ def gather(
     complete = 1
     for child in range(count):
         link = links[index[node.links_at + child]]
-        said = hear(link, run, real, whole, time_ns)
+        said = hear(link, real, whole, time_ns)
         if said < 0:
             complete = 0
             continue
@@ -108,7 +108,7 @@ def steer(
     complete = whole[node.has_state_at]
     rates = forces = -1
     if node.link >= 0:
-        said = hear(links[node.link], run, real, whole, time_ns)
+        said = hear(links[node.link], real, whole, time_ns)
         if said < 0:
             complete = 0
         else:

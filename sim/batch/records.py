@@ -26,8 +26,10 @@ RUN: Final = _record(
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
     # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and their velocities; places of robots
     # before, and their order (potential); square of the smallest distance; the pair and its instant, then the number of
-    # violations; references of `REFERENCES` instants, and these (late_states); a hash table (ages)
-    "due_at places_at rates_at before_at order_at distance_at closest_at references_at references_ns_at slots_at "
+    # violations; references of `REFERENCES` instants, and these (late_states)
+    "due_at places_at rates_at before_at order_at distance_at closest_at references_at references_ns_at "
+    # number of places in `whole` that are zero at the start
+    "zeros "
     # from when on amplitudes are summed up: the last three sixths of the run [ns]
     "sooner_ns earlier_ns last_ns",
     # `ahead`: how far the feed-forward is led [s]; ticks in a nanosecond
@@ -79,8 +81,8 @@ LINK: Final = _record(
     "length mask stream_at stream_marks_at prompt timeout_ns end_ns at zeros_at marks_at "
     # how a late state is brought to the present (below), whether it is a robot's, whether clocks are wrong
     "brought of_robot odd_clocks "
-    # ages of what is used: list, numbers of uses and bins in `whole` (ages)
-    "ages_at uses_at bins_at "
+    # ages of what is used: a hash table of mask + 1 slots, and bins, in `whole` (ages)
+    "ages_at ages_mask bins bins_at "
     "first_1 size_1 first_2 size_2 first_3 size_3 "
     # fates: all delays the same; how they are told, bounds; in `indices` tables, instants, blackouts; correlation
     "fixed kind delay_min_ns delay_span_ns table_at table_size times_at normal_at rho rest windows_at windows "
@@ -125,12 +127,7 @@ NEXT, HEARD, LATEST, KEY_0, KEY_1, KEY_2, KEY_3, BAD, Z = range(12, 21)
 F_OWN, F_LOSS, F_COPY, F_BURST = 21, 25, 29, 33
 """Draws of two messages"""
 AGED, AGES, AGE_P50, AGE_P95, AGE_P99 = range(37, 42)
-"""Uses of messages older than the instant; number of their different ages once they are counted one by one, -1 if there are too
-many; percentiles (ages)"""
-LISTED: Final = 2048
-"""Length of a list of ages"""
-SLOTS: Final = 2048
-"""Size of the hash table of ages"""
+"""Uses of messages older than the instant; number of their different ages, -1 if there are too many; percentiles (ages)"""
 LINK_WHOLES: Final = 42
 """After these come the arrivals of the newest messages [ns], `FAR` for those that are lost or arrive after the end of the run,
 then those of their second copies"""

@@ -46,7 +46,7 @@ def say(stream: Any, whole: Any, time_ns: int, is_null: int) -> None:
 
 
 @compiled
-def hear(link: Any, run: Any, real: Any, whole: Any, time_ns: int) -> int:
+def hear(link: Any, real: Any, whole: Any, time_ns: int) -> int:
     """Returns where in `real` the values of the message in use on a link at `time_ns` are, or -1 if none is in use; counts the
     use.  Must be called with ascending instants, after `take_up`."""
     marks = link.marks_at
@@ -81,7 +81,7 @@ def hear(link: Any, run: Any, real: Any, whole: Any, time_ns: int) -> int:
         whole[marks + AGE_SUM] += age
         if age > whole[marks + AGE_MAX]:
             whole[marks + AGE_MAX] = age
-        note_age(link, run, whole, age)
+        note_age(link, whole, age)
     return int(place)
 
 
@@ -193,7 +193,7 @@ def _expires_ns(link: Any, sent_ns: int) -> int:
 
 
 @apart
-def finish(link: Any, run: Any, whole: Any) -> None:
+def finish(link: Any, whole: Any) -> None:
     """Takes back what was counted and had not arrived when the receiver looked last; finds the percentiles of the ages."""
     if not link.prompt:
         marks, arrivals = link.marks_at, link.marks_at + LINK_WHOLES
@@ -203,4 +203,4 @@ def finish(link: Any, run: Any, whole: Any) -> None:
             whole[marks + DELIVERED] -= heard_ns < whole[arrival] < FAR
             if link.duplicates > 0.0:
                 whole[marks + DUPLICATES] -= heard_ns < whole[arrival + link.mask + 1] < FAR
-    find_percentiles(link, run, whole)
+    find_percentiles(link, whole)

@@ -117,7 +117,7 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
     now_ns, end_ns = due_ns, due_ns + robot.period_ns
     take_up(link, index, whole)
     while now_ns < end_ns:
-        said, until_ns = hear(link, run, real, whole, now_ns), end_ns
+        said, until_ns = hear(link, real, whole, now_ns), end_ns
         if robot.on_arrival:
             change = change_ns(link, whole, now_ns)
             until_ns = change if change < end_ns and change <= run.duration_ns else end_ns
@@ -134,7 +134,7 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
 def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any, real: Any, whole: Any) -> None:
     for place in range(len(real)):
         real[place] = 0.0
-    for place in range(len(whole)):
+    for place in range(run.zeros):
         whole[place] = 0
     for place in range(REFERENCES):
         whole[run.references_ns_at + place] = -1
@@ -209,7 +209,7 @@ def many_runs(
     for number in range(first, last):
         lost_ns[number] = whole_run(model, keys[number], real, whole, traces[min(number, len(traces) - 1)], sums)
         for at in range(len(model.links)):
-            finish(model.links[at], model.run[0], whole)
+            finish(model.links[at], whole)
         for place in range(len(kept_reals)):
             reals[number, place] = real[kept_reals[place]]
         for place in range(len(kept_wholes)):

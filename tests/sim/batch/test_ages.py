@@ -20,8 +20,9 @@ AGES: dict[str, list[int]] = {
     "more and more": [int(age) for age in 1 + DRAWN.uniform(0, 1, 8000) * np.arange(8000) / 6],
     "of all sizes": [int(age) for age in 10 ** DRAWN.uniform(0, 10.4, 3000)],
     "random, few": DRAWN.integers(10_000_000, 50_000_000, 900).tolist(),
-    "a full list": [*range(1, EXACT + 1), *range(1, EXACT + 1)],
-    "a full list, all of them different": list(range(1, 2 * EXACT + 1)),
+    "all that are counted one by one, twice": [*range(1, EXACT + 1), *range(1, EXACT + 1)],
+    "twice as many, all of them different": list(range(1, 2 * EXACT + 1)),
+    "all in one slot": [((1 << 24) * number) for number in range(1, 600)],
     "random, many": DRAWN.integers(10_000_000, 50_000_000, 5000).tolist(),
 }
 
@@ -30,17 +31,16 @@ AGES: dict[str, list[int]] = {
 @pytest.mark.parametrize("kind", AGES)
 def test_percentiles_are_those_of_the_runtime(kind: str, zeros: int) -> None:
     ages, expected = AGES[kind], AgeCounts()
-    uses = r.LINK_WHOLES + r.LISTED
-    slots = uses + EXACT
-    bins = slots + r.SLOTS
-    (link,) = records_of(r.LINK, [{"ages_at": r.LINK_WHOLES, "uses_at": uses, "bins_at": bins}])
-    (run,) = records_of(r.RUN, [{"slots_at": slots}])
+    slots = 2 * EXACT
+    bins = r.LINK_WHOLES + 2 * slots
+    (link,) = records_of(r.LINK, [{"ages_at": r.LINK_WHOLES, "ages_mask": slots - 1, "bins": 36 << 7, "bins_at": bins}])
     whole = np.zeros(bins + (36 << 7), dtype=np.int64)
+    whole[bins:] = 7  # of an earlier run
     for age_ns in ages:
         expected.note(age_ns)
-        note_age(link, run, whole, age_ns)
+        note_age(link, whole, age_ns)
     whole[r.USED], whole[r.AGE_MAX] = len(ages) + zeros, max(ages, default=0)
-    find_percentiles(link, run, whole)
+    find_percentiles(link, whole)
     wanted = expected.percentiles(PERCENTILES, zeros) if ages else [0] * 3
     assert whole[r.AGE_P50 : r.AGE_P99 + 1].tolist() == [min(age_ns, whole[r.AGE_MAX]) for age_ns in wanted]
 

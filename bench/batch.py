@@ -213,6 +213,11 @@ def measure(
     kinds: dict[str, tuple[Callable[[Plan, int], Array], Plan, int]] = {
         "lab.toml, many runs: batch engine": (batch, lab(SECONDS["batch"]), RUNS["batch"]),
         "lab.toml, many runs: the same, late and lossy": (batch, lab(SECONDS["batch"], LATE), RUNS["batch"]),
+        "lab.toml, many runs: late and lossy, time-driven": (
+            batch,
+            lab(SECONDS["batch"], LATE, 'timing="time_driven"'),
+            RUNS["batch"],
+        ),
         "lab.toml, many runs: loop of numpy arrays": (plain_numpy, lab(SECONDS["numpy"]), RUNS["numpy"]),
         "lab.toml, one run: loop in plain Python": (plain_python, lab(SECONDS["python"]), RUNS["python"]),
     }

@@ -179,12 +179,12 @@ def test_without_vmas_and_gpu_the_others_are_measured(monkeypatch: pytest.Monkey
     monkeypatch.setattr(batch, "gpu_refusal", lambda: "engine gpu: there is none")
     monkeypatch.setattr(batch, "sweep_s", lambda: 25.0)
     rows, failures = batch.measure(1, python=python)
-    assert [row.what for row in rows[4:]] == [
+    assert [row.what for row in rows[5:]] == [
         "9 robots, many runs: batch engine",
         "90 robots, many runs: batch engine",
         "sweep: 1 runs of lab, 0.1 s each, tables written",
     ]
-    assert [row.unit for row in rows] == ["10⁶ steps/s"] * 6 + ["s"]
+    assert [row.unit for row in rows] == ["10⁶ steps/s"] * 7 + ["s"]
     assert sorted(failures) == ["gpu", "vmas"]
     assert re.search(told, batch.told(failures), re.MULTILINE)
     assert "gpu: engine gpu: there is none\n" in batch.told(failures)
@@ -199,7 +199,7 @@ def test_with_a_gpu_it_has_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "on_gpu", lambda plan, runs: asked.append((plan.duration_ns / 1e9, runs)))
     monkeypatch.setattr(batch, "sweep_s", lambda: 25.0)
     rows, failures = batch.measure(1, python=ROOT / "no-such-environment")
-    assert rows[4].what == "lab.toml, many runs: batch engine on the GPU"
+    assert rows[5].what == "lab.toml, many runs: batch engine on the GPU"
     assert asked[-1] == (0.1, 12)
     assert list(failures) == ["vmas"]
 

@@ -7,7 +7,7 @@ instant is later than all before.  So it is enough to keep the last instant at w
 """
 
 from math import isfinite, sqrt
-from typing import Any
+from typing import Any, Final
 
 from echelon.sim.batch.compiled import fused
 from echelon.sim.batch.law import desired, to_shape
@@ -30,6 +30,11 @@ from echelon.sim.batch.records import (
     SIN,
     V,
 )
+
+_SURELY: Final = 1 + 1e-9
+"""More than what is lost by rounding"""
+_SEEN: Final = 1.5
+"""So many times the distance that counts robots look for others, so that they need not look at each instant"""
 
 
 @fused
@@ -142,30 +147,41 @@ def _note_error(
 
 @fused
 def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
-    """Notes how close robots came since the last instant, on straight lines (sim.results.distances)."""
+    """Notes how close robots came since the last instant, on straight lines (sim.results.distances).
+
+    Pairs are looked at only if one of them may have come as near as counts.  Two robots come nearer to each other by at most
+    twice the largest motion relative to the first robot."""
     now, before = run.places_at, run.before_at
+    common_x, common_y = real[now] - real[before], real[now + 1] - real[before + 1]
     fastest = 0.0
-    for robot in range(robots):
-        dx, dy = (
-            real[now + 2 * robot] - real[before + 2 * robot],
-            real[now + 2 * robot + 1] - real[before + 2 * robot + 1],
-        )
+    for robot in range(1, robots):
+        dx = real[now + 2 * robot] - real[before + 2 * robot] - common_x
+        dy = real[now + 2 * robot + 1] - real[before + 2 * robot + 1] - common_y
         fastest = max(fastest, dx * dx + dy * dy)
     radius = run.avoidance_radius * run.avoidance_radius
-    reach = sqrt(max(real[run.distance_at], radius)) + 2 * sqrt(fastest)
+    near, moved = sqrt(max(real[run.distance_at], radius)), 2 * sqrt(fastest)
+    apart = real[run.apart_at] - moved
+    if apart > near * _SURELY:
+        real[run.apart_at] = apart
+        return
+    reach, seen = near + moved, _SEEN * near + moved
     order = run.order_at
     axis = sort_along(robots, before, order, real, whole)
+    least = 1e300 if axis < 0 else seen * seen
     for place in range(robots - 1):
         one = place if axis < 0 else whole[order + place]
         x, y = real[before + 2 * one], real[before + 2 * one + 1]
-        last = x + reach if axis == 0 else y + reach
+        last = x + seen if axis == 0 else y + seen
         for later in range(place + 1, robots):
             other = later if axis < 0 else whole[order + later]
             if axis >= 0 and real[before + 2 * other + axis] > last:
                 break
             x_apart, y_apart = real[before + 2 * other] - x, real[before + 2 * other + 1] - y
-            if x_apart * x_apart + y_apart * y_apart <= reach * reach:
+            square = x_apart * x_apart + y_apart * y_apart
+            least = min(least, square)
+            if square <= reach * reach:
                 _note_distance(run, one, other, real, whole, time_ns, step_ns)
+    real[run.apart_at] = sqrt(least) - moved
 
 
 @fused

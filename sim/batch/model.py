@@ -234,6 +234,7 @@ class ModelMaker:
             "before_at": pools.real(2 * len(plan.robots)),
             "order_at": pools.whole(len(plan.robots) + 1),
             "distance_at": pools.real(1),
+            "apart_at": pools.real(1),
             "closest_at": pools.whole(4),
             "references_at": pools.real(4 * r.REFERENCES),
             "references_ns_at": pools.whole(r.REFERENCES),

@@ -25,9 +25,9 @@ RUN: Final = _record(
     # instants [ns]; whether robots avoid each other; law and trajectory (below), the trajectory's numbers in `table`
     "duration_ns tick_ns common_ns avoidance law trajectory trajectory_at trajectory_legs fractions_at fractions "
     # scratch: instants at which robots, then nodes, are due; places of robots and nodes, and their velocities; places of robots
-    # before, and their order (potential); square of the smallest distance; the pair and its instant, then the number of
-    # violations; references of `REFERENCES` instants, and these (late_states)
-    "due_at places_at rates_at before_at order_at distance_at closest_at references_at references_ns_at "
+    # before, and their order (potential); square of the smallest distance; a distance that no two robots are below;
+    # the pair and its instant, then the number of violations; references of `REFERENCES` instants, and these (late_states)
+    "due_at places_at rates_at before_at order_at distance_at apart_at closest_at references_at references_ns_at "
     # number of places in `whole` that are zero at the start
     "zeros "
     # from when on amplitudes are summed up: the last three sixths of the run [ns]

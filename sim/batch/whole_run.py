@@ -157,6 +157,7 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
         for mark in range(run.fractions + 1):
             whole[marks + M_FINITE + 1 + mark] = -1
     real[run.distance_at] = 1e300
+    real[run.apart_at] = -1.0
     for place in range(len(robots)):
         whole[run.order_at + place] = place
     for number in range(len(nodes)):

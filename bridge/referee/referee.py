@@ -150,8 +150,11 @@ class Referee:
             for deadline in traffic.deadlines.values():
                 deadline.forget()
 
-    def finish(self, time_ns: int) -> list[Finding]:
-        """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came."""
+    def finish(self, time_ns: int, cut: bool = False) -> list[Finding]:
+        """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came.
+
+        `cut`: the frames may end within a run, some earlier than others.  What is late then is silent only after a watchdog and
+        a period, as while a run goes on, and where no frame came at all nothing is missing."""
         said: list[Finding] = []
         time_ns = max(time_ns, *(traffic.last_ns for traffic in self._buses))
         if self._torn:
@@ -161,7 +164,7 @@ class Referee:
                 traffic.busy_ns = time_ns
         begin_ns = min((traffic.first_ns for traffic in self._buses if traffic.first_ns is not None), default=-NEVER_NS)
         for bus, traffic in enumerate(self._buses):
-            said += self._scan(time_ns, bus, ended=True)
+            said += self._scan(time_ns, bus, ended=not cut)
             unheard = {robot.name for robot in self.robots if robot.plan.drive.bus == bus} - {
                 robot.name
                 for deadline in traffic.deadlines.values()
@@ -173,6 +176,7 @@ class Referee:
                     not deadline.period_ns
                     or deadline.frames
                     or self._was_torn
+                    or (cut and begin_ns == -NEVER_NS)
                     or time_ns - begin_ns < 2 * deadline.period_ns + deadline.half_ns
                 ):
                     continue

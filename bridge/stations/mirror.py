@@ -66,6 +66,8 @@ class MirrorBridge(Bridge):
         self._sequence = 0
         self._time_ns = 0
         self._stopped = False
+        self._stop_ns: int | None = None
+        """When the wheels were stopped"""
 
     def take(self, messages: Sequence[Message]) -> list[Message]:
         """Sends the torques in the robots' states; returns messages with the frames: one per instant, or one on a wall clock.
@@ -121,6 +123,7 @@ class MirrorBridge(Bridge):
             for robot, frame in stops
         ]
         frames.sort(key=lambda timed: timed.time_ns)
+        self._stop_ns = frames[0].time_ns if frames else self._time_ns + 1
         wall_ns = time.monotonic_ns()
         for time_ns, bus, _, (can_id, data, remote) in send_all(self._buses, frames):
             self._log.write(time_ns, can_id, data, wall_ns, self._names[bus], remote)
@@ -184,6 +187,7 @@ class MirrorBridge(Bridge):
             },
             intrusions=intrusions(self._plan, self._buses),
             messages=self._sequence,
+            wheels_stopped=None if self._stop_ns is None else self._stop_ns / 1e9,
         )
 
     def _loads(self) -> list[float]:

@@ -27,7 +27,7 @@ class Terms(NamedTuple):
     whole: bool
     """True if the log must go to the end of the run.  Of a run that goes on, was stopped or broke off it need not"""
     until_ns: int | None
-    """Run time up to which frames are judged [ns], if the run was stopped: what its stop sends is no finding"""
+    """Run time up to which frames are judged [ns], if the run was stopped or broke off: what its stop sends is no finding"""
 
 
 def terms_of(folder: Path, plan: Plan) -> Terms:
@@ -37,13 +37,14 @@ def terms_of(folder: Path, plan: Plan) -> Terms:
     state = read_state(folder)
     try:
         summary = read_json((folder / "summary.json").read_bytes())
-        run, until_s = dict(summary["run"]), summary["simulated"]
+        run, can = dict(summary["run"]), summary["can"]
     except (OSError, ValueError, KeyError, TypeError):
-        run, until_s = {}, None
+        run, can = {}, None
+    referee = can.get("referee") if isinstance(can, dict) else None
+    until_s = referee.get("until") if isinstance(referee, dict) else None
     clock = run.get("clock") or (state.clock if state else "")
     whole = not (run.get("failure") or run.get("stopped") or goes_on(folder))
-    known = isinstance(until_s, int | float) and abs(until_s) < 1e9
-    until_ns = round(until_s * 1e9) if known and run.get("stopped") else None
+    until_ns = round(until_s * 1e9) if isinstance(until_s, int | float) and abs(until_s) < 1e9 else None
     return Terms(plan.can.watchdog_ns // 2 if clock == "wall" else None, whole, until_ns)
 
 

@@ -99,6 +99,7 @@ class MirrorBridge(Bridge):
             for identifier, data, _ in frames:
                 if not buses[number].send(identifier, data, sent_ns) and clock is not None:
                     self._lost[number] += 1
+                    self._mirror.unsent(source)
                     continue
                 log.write(sent_ns, identifier, data, wall_ns, names[number])
                 add_words(words, sent_ns, number, BRIDGE_NODE, identifier, data)

@@ -23,8 +23,16 @@ def until_ns(plan: Plan, outcome: Outcome) -> int | None:
 def judged(log: Path, plan: Plan, clock: str, whole: bool, until_ns: int | None = None) -> RefereeReport:
     """Returns the referee's report on a run's can.log.
 
-    On a wall clock frames may be later, since processes wait for a processor.  `whole` and `until_ns` as in `judge_log`."""
+    On a wall clock frames may be later, since processes wait for a processor, and those after the end of the run are not
+    judged, as a referee that listens does not judge them.  `whole` and `until_ns` as in `judge_log`."""
     from echelon.bridge.referee.log import judge_log
 
-    tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
-    return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole, until_ns=until_ns)
+    wall = clock == "wall"
+    return judge_log(
+        log,
+        plan,
+        tolerance_ns=plan.can.watchdog_ns // 2 if wall else None,
+        whole=whole,
+        until_ns=until_ns,
+        end_ns=plan.duration_ns if wall else None,
+    )

@@ -64,6 +64,8 @@ class Referee:
         """The first findings"""
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
         self.late = late
+        self.over = False
+        """True after `rest`"""
         self._silence_ns = plan.can.watchdog_ns
         self._torn = self._was_torn = False
         self._blind_until_ns = -NEVER_NS
@@ -149,6 +151,10 @@ class Referee:
         for traffic in self._buses:
             for deadline in traffic.deadlines.values():
                 deadline.forget()
+
+    def rest(self) -> None:
+        """Says that what comes from now on is the end of a run, such as its own stop of the wheels: it is no finding."""
+        self.over, self._blind_until_ns = True, NEVER_NS
 
     def finish(self, time_ns: int, cut: bool = False) -> list[Finding]:
         """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came.

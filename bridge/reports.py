@@ -247,6 +247,9 @@ class CanReport:
     """What the referee found; None if nothing was judged"""
     messages: int = 0
     """Messages that the bridge sent to recorders and other listeners"""
+    wheels_stopped: float | None = None
+    """When the bridge stopped the wheels at the end of the run [s]: from then on can.log has the frames of this stop; None if
+    the run was killed and recovered"""
 
     @property
     def stopped(self) -> dict[str, int]:

@@ -18,6 +18,7 @@ from echelon.errors import UserError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
+from echelon.sim.judged_log import judged
 from echelon.sim.out_folder import CUT, RECORDING, REPORT, SUMMARY, note_again
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import (
@@ -33,7 +34,6 @@ from echelon.sim.results.records import RunFacts
 from echelon.sim.results.rendering import read_summary, write_summary
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import Trace
-from echelon.sim.run import judged
 from echelon.sim.run_folder import report_on
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Final
 
 from echelon import __version__
-from echelon.bridge.referee_reports import RefereeReport
 from echelon.bridge.stations.closed import LOG
 from echelon.bridge.stations.opening import open_bridge
 from echelon.errors import PartRunError
@@ -29,6 +28,7 @@ from echelon.scenario.tables import Scenario
 from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import Interruption, Raises, interruption
+from echelon.sim.judged_log import judged, until_ns
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.observing import TICKET
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
@@ -125,12 +125,11 @@ def execute(
             display.say(f"open to observers: echelon observe {folder} ({where})")
         outcome = supervisor.run()
     can = outcome.can
-    if can is not None and (can.referee is None or outcome.stopped):
-        common_ns = outcome.trace.common_ns()
-        until_ns = int(common_ns[-1]) if outcome.stopped and len(common_ns) else None
-        whole = not (outcome.failure or outcome.stopped)
+    whole = not (outcome.failure or outcome.stopped)
+    # a referee that listens does not know when a run breaks off
+    if can is not None and (can.referee is None or not whole):
         try:
-            can = replace(can, referee=judged(folder / LOG, plan, clock, whole, until_ns))
+            can = replace(can, referee=judged(folder / LOG, plan, clock, whole, until_ns(plan, outcome)))
         except PartRunError as error:
             outcome.failure = outcome.failure or str(error)
     display.close()
@@ -144,16 +143,6 @@ def execute(
             error.add_note(outcome.failure)
         raise
     return summary, outcome.trace
-
-
-def judged(log: Path, plan: Plan, clock: str, whole: bool, until_ns: int | None = None) -> RefereeReport:
-    """Returns the referee's report on a run's can.log.
-
-    On a wall clock frames may be later, since processes wait for a processor.  `whole` and `until_ns` as in `judge_log`."""
-    from echelon.bridge.referee.log import judge_log
-
-    tolerance_ns = plan.can.watchdog_ns // 2 if clock == "wall" else None
-    return judge_log(log, plan, tolerance_ns=tolerance_ns, whole=whole, until_ns=until_ns)
 
 
 def _in_process(

@@ -97,12 +97,15 @@ def judge_log(
     tolerance_ns: int | None = None,
     whole: bool = True,
     until_ns: int | None = None,
+    end_ns: int | None = None,
 ) -> RefereeReport:
     """Returns the referee's report on a log; `names` as in `PlanLog`.
 
     `whole` says that the run was not cut off: then cyclic frames that are missing at the end of the log are silence.  Of a run
-    that was stopped, only frames up to `until_ns` are judged: some processes go on for a while, others do not.  A log of
-    somebody else may begin and end within a run.  Raises OSError if the log cannot be read."""
+    that was stopped or broke off, only frames up to `until_ns` are judged: some processes go on for a while, others do not, and
+    what its own stop sends is no finding.  Frames after `end_ns`, the end of a run on a wall clock, are left out: processes
+    then stop one after the other.  A log of somebody else may begin and end within a run.  Raises OSError if the log cannot be
+    read."""
     log = PlanLog(read_log(path), plan, names)
     referee = Referee(plan, tolerance_ns=tolerance_ns)
     last_ns = later = 0
@@ -112,12 +115,14 @@ def judge_log(
             continue
         time_ns, bus, frame = entry
         referee.late = log.foreign
+        if until_ns is None and end_ns is not None and time_ns > end_ns:
+            continue
         if until_ns is None or time_ns <= until_ns:
             last_ns = time_ns
             referee.observe(time_ns, bus, frame)
         else:
             later += 1
-    referee.finish(max(last_ns, plan.duration_ns) if whole and not log.foreign else last_ns)
+    referee.finish(max(last_ns, plan.duration_ns) if whole and not log.foreign else last_ns, cut=not whole)
     return replace(
         referee.report(),
         until=None if until_ns is None else until_ns / 1e9,

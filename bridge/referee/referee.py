@@ -64,6 +64,8 @@ class Referee:
         """The first findings"""
         self.robots = [WheelCheck(plan, robot, tolerance_ns or 0) for robot in plan.robots]
         self.late = late
+        self.over = False
+        """True after `rest`"""
         self._silence_ns = plan.can.watchdog_ns
         self._torn = self._was_torn = False
         self._blind_until_ns = -NEVER_NS
@@ -150,8 +152,15 @@ class Referee:
             for deadline in traffic.deadlines.values():
                 deadline.forget()
 
-    def finish(self, time_ns: int) -> list[Finding]:
-        """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came."""
+    def rest(self) -> None:
+        """Says that what comes from now on is the end of a run, such as its own stop of the wheels: it is no finding."""
+        self.over, self._blind_until_ns = True, NEVER_NS
+
+    def finish(self, time_ns: int, cut: bool = False) -> list[Finding]:
+        """Ends the listening at `time_ns`; returns findings for the identifiers that are silent then or never came.
+
+        `cut`: the frames may end within a run, some earlier than others.  What is late then is silent only after a watchdog and
+        a period, as while a run goes on, and where no frame came at all nothing is missing."""
         said: list[Finding] = []
         time_ns = max(time_ns, *(traffic.last_ns for traffic in self._buses))
         if self._torn:
@@ -161,7 +170,7 @@ class Referee:
                 traffic.busy_ns = time_ns
         begin_ns = min((traffic.first_ns for traffic in self._buses if traffic.first_ns is not None), default=-NEVER_NS)
         for bus, traffic in enumerate(self._buses):
-            said += self._scan(time_ns, bus, ended=True)
+            said += self._scan(time_ns, bus, ended=not cut)
             unheard = {robot.name for robot in self.robots if robot.plan.drive.bus == bus} - {
                 robot.name
                 for deadline in traffic.deadlines.values()
@@ -173,6 +182,7 @@ class Referee:
                     not deadline.period_ns
                     or deadline.frames
                     or self._was_torn
+                    or (cut and begin_ns == -NEVER_NS)
                     or time_ns - begin_ns < 2 * deadline.period_ns + deadline.half_ns
                 ):
                     continue

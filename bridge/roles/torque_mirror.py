@@ -2,7 +2,8 @@
 
 Each robot sends its torques once per acceleration period. They become frames at once, so frames have the order of the torques:
 by time, then by robot. Torques that must not reach a wheel, or that the envelope rejects, become frames with zero torque
-that do not enable. So drives stop instead of holding the torque before.
+that do not enable. So drives stop instead of holding the torque before. The next frame that enables has zero torque: drives
+refuse any other. The limits of the envelope count from this zero.
 """
 
 import math
@@ -52,6 +53,7 @@ class TorqueMirror:
         "_envelopes",
         "_hosts",
         "_period_ns",
+        "_zero_first",
         "counts",
         "frames",
     )
@@ -68,6 +70,8 @@ class TorqueMirror:
         self._hosts = tuple(hosts)
         self._period_ns = periods
         self._envelopes = [Envelope(plan) for plan in envelopes]
+        self._zero_first = [False for _ in hosts]
+        """For each robot, whether its drives were disabled, or may have been, so that the next frame has zero torque"""
         self.counts = [RobotCounts() for _ in hosts]
         self.frames = 0
 
@@ -76,8 +80,9 @@ class TorqueMirror:
     ) -> list[Frame]:
         """Returns the frames for the torques [N m] that robot number `robot` commands at `time_ns`.
 
-        Torques that are not finite, or older than the last ones, give frames that stop the robot's drives. A second pair of
-        torques for the same instant gives no frame. Raises IndexError for an unknown robot."""
+        Torques that are not finite, or older than the last ones, give frames that stop the robot's drives. The first torques
+        after such frames give frames that enable with zero torque. A second pair of torques for the same instant gives no
+        frame. Raises IndexError for an unknown robot."""
         counts = self.counts[robot]
         last = counts.last_ns
         if last is not None and time_ns <= last:
@@ -99,6 +104,11 @@ class TorqueMirror:
             tau_right, tau_left, reason = self._envelopes[robot].check(time_ns, time_ns, tau_right, tau_left)
             if reason is not None:
                 return self.stop(robot, reason)
+        if self._zero_first[robot]:
+            self._zero_first[robot] = False
+            tau_right = tau_left = 0.0
+            if self._envelopes:
+                self._envelopes[robot].stop(time_ns)
         counts.saturated += saturated
         host = self._hosts[robot]
         clipped = host.clipped
@@ -112,7 +122,12 @@ class TorqueMirror:
         counts.stopped[why.value] = counts.stopped.get(why.value, 0) + 1
         if self._envelopes and counts.last_ns is not None:
             self._envelopes[robot].stop(counts.last_ns)
+        self._zero_first[robot] = True
         return self._send(robot, self._hosts[robot].mirror(0.0, 0.0, False))
+
+    def unsent(self, robot: int) -> None:
+        """Says that a bus did not take a robot's last frames: its drives may be disabled still."""
+        self._zero_first[robot] = True
 
     def end(self) -> tuple[list[tuple[int, Frame]], BaseException | None]:
         """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot, and what a

@@ -54,6 +54,8 @@ class ClosedBridge(Bridge):
         self._log = CanLog(folder / LOG, self._names[0])
         self.frames = 0
         self._robots: dict[str, WheelsReport] = {}
+        self._stop_ns: int | None = None
+        """When the wheels were stopped"""
         self.stages: tuple[Stage, ...] = self.role.stages
         if self.buses and paired:
             self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.log)
@@ -93,6 +95,7 @@ class ClosedBridge(Bridge):
 
         A bus that is full takes them within `STOP_S`, or not at all; then the drives' own watchdogs take the torque away."""
         self._robots = self.role.reports()
+        self._stop_ns = time_ns
         frames, failure = self.role.stop(time_ns)
         return (send_all(self.buses, frames) if self.buses else frames), failure
 
@@ -151,6 +154,7 @@ class ClosedBridge(Bridge):
             foreign=self.rail.foreign,
             intrusions=intrusions(self.plan, self.buses),
             refused=dict(self.role.refused),
+            wheels_stopped=None if self._stop_ns is None else self._stop_ns / 1e9,
         )
 
 

@@ -66,6 +66,8 @@ class MirrorBridge(Bridge):
         self._sequence = 0
         self._time_ns = 0
         self._stopped = False
+        self._stop_ns: int | None = None
+        """When the wheels were stopped"""
 
     def take(self, messages: Sequence[Message]) -> list[Message]:
         """Sends the torques in the robots' states; returns messages with the frames: one per instant, or one on a wall clock.
@@ -97,6 +99,7 @@ class MirrorBridge(Bridge):
             for identifier, data, _ in frames:
                 if not buses[number].send(identifier, data, sent_ns) and clock is not None:
                     self._lost[number] += 1
+                    self._mirror.unsent(source)
                     continue
                 log.write(sent_ns, identifier, data, wall_ns, names[number])
                 add_words(words, sent_ns, number, BRIDGE_NODE, identifier, data)
@@ -121,6 +124,7 @@ class MirrorBridge(Bridge):
             for robot, frame in stops
         ]
         frames.sort(key=lambda timed: timed.time_ns)
+        self._stop_ns = frames[0].time_ns if frames else self._time_ns + 1
         wall_ns = time.monotonic_ns()
         for time_ns, bus, _, (can_id, data, remote) in send_all(self._buses, frames):
             self._log.write(time_ns, can_id, data, wall_ns, self._names[bus], remote)
@@ -184,6 +188,7 @@ class MirrorBridge(Bridge):
             },
             intrusions=intrusions(self._plan, self._buses),
             messages=self._sequence,
+            wheels_stopped=None if self._stop_ns is None else self._stop_ns / 1e9,
         )
 
     def _loads(self) -> list[float]:

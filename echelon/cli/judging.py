@@ -27,7 +27,14 @@ class Terms(NamedTuple):
     whole: bool
     """True if the log must go to the end of the run.  Of a run that goes on, was stopped or broke off it need not"""
     until_ns: int | None
-    """Run time up to which frames are judged [ns], if the run was stopped: what its stop sends is no finding"""
+    """Run time up to which frames are judged [ns], if the run was stopped or broke off: what its stop sends is no finding"""
+    end_ns: int | None
+    """End of a run on a wall clock [ns]: later frames are no findings, either"""
+
+    @property
+    def last_ns(self) -> int | None:
+        """Run time up to which frames are judged [ns]; None: all are."""
+        return self.end_ns if self.until_ns is None else self.until_ns
 
 
 def terms_of(folder: Path, plan: Plan) -> Terms:
@@ -37,14 +44,17 @@ def terms_of(folder: Path, plan: Plan) -> Terms:
     state = read_state(folder)
     try:
         summary = read_json((folder / "summary.json").read_bytes())
-        run, until_s = dict(summary["run"]), summary["simulated"]
+        run, can = dict(summary["run"]), summary["can"]
     except (OSError, ValueError, KeyError, TypeError):
-        run, until_s = {}, None
+        run, can = {}, None
+    referee = can.get("referee") if isinstance(can, dict) else None
+    until_s = referee.get("until") if isinstance(referee, dict) else None
     clock = run.get("clock") or (state.clock if state else "")
     whole = not (run.get("failure") or run.get("stopped") or goes_on(folder))
-    known = isinstance(until_s, int | float) and abs(until_s) < 1e9
-    until_ns = round(until_s * 1e9) if known and run.get("stopped") else None
-    return Terms(plan.can.watchdog_ns // 2 if clock == "wall" else None, whole, until_ns)
+    until_ns = round(until_s * 1e9) if isinstance(until_s, int | float) and abs(until_s) < 1e9 else None
+    wall = clock == "wall"
+    tolerance_ns, end_ns = (plan.can.watchdog_ns // 2, plan.duration_ns) if wall else (None, None)
+    return Terms(tolerance_ns, whole, until_ns, end_ns)
 
 
 def judge_run(plan: Plan, folder: Path) -> RefereeReport:
@@ -53,9 +63,7 @@ def judge_run(plan: Plan, folder: Path) -> RefereeReport:
     Raises UsageError if the log cannot be read, or holds things but no frame of the plan."""
     terms = terms_of(folder, plan)
     try:
-        report = judge_log(
-            folder / LOG, plan, tolerance_ns=terms.tolerance_ns, whole=terms.whole, until_ns=terms.until_ns
-        )
+        report = judge_log(folder / LOG, plan, **terms._asdict())
     except OSError as error:
         raise UsageError(f"{folder / LOG}: {error.strerror}") from None
     if report.left_out and not report.frames:

@@ -43,9 +43,12 @@ def show_end(plan: Plan, folder: Path, as_json: bool) -> None:
     terms = terms_of(folder, plan)
     table = CanTable(plan, Referee(plan, tolerance_ns=terms.tolerance_ns), _names(plan))
     for logged in read_log(folder, plan):
-        if terms.until_ns is None or logged[0] <= terms.until_ns:
-            table.take(*logged)
-    _finish(table, terms)
+        if terms.last_ns is not None and logged[0] > terms.last_ns and not table.referee.over:
+            _finish(table, terms)
+            table.referee.rest()
+        table.take(*logged)
+    if not table.referee.over:
+        _finish(table, terms)
     if as_json:
         print(json.dumps(table.data(table.time_ns), allow_nan=False))
     else:
@@ -94,7 +97,8 @@ def _show(table: CanTable, heard: Iterator[Heard], as_json: bool, console: Conso
 
 def _finish(table: CanTable, terms: Terms) -> None:
     """Ends the judgement of a run that is over: at its planned end if the log must reach it, else at the last frame."""
-    table.referee.finish(max(table.time_ns, table.plan.duration_ns) if terms.whole else table.time_ns)
+    end_ns = max(table.time_ns, table.plan.duration_ns) if terms.whole else table.time_ns
+    table.referee.finish(end_ns, cut=not terms.whole)
 
 
 def _names(plan: Plan) -> tuple[str, ...]:

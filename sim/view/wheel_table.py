@@ -82,7 +82,8 @@ class CanTable:
         self._bits[bus].add(time_ns, frame_bits(*frame) if not (frame.remote and frame.data) else 0)
         for rate in self._owners[bus].get(frame.can_id, ()):
             rate.add(time_ns)
-        self._last += self.referee.observe(time_ns, bus, frame)
+        found = self.referee.observe(time_ns, bus, frame)
+        self._last += found if not self.referee.over else ()
 
     def data(self, time_ns: int) -> dict[str, Any]:
         """Returns the present state as data for JSON: SI units, None for unknown values."""

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from echelon.bridge.can.canlog import CanLog
 from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.protocols.observe import Finding
 from echelon.bridge.referee.log import judge_log
 from echelon.bridge.referee.referee import KEPT, Referee
 from echelon.bridge.referee_reports import FindingReport
@@ -413,6 +414,17 @@ def test_silence_is_told_once_while_it_lasts(mirror: Plan) -> None:
     assert {found.kind for found in referee.finish(1200 * MS)} == {"silent"}
 
 
+def test_where_a_run_is_cut_off_only_a_long_silence_is_told(mirror: Plan) -> None:
+    def told(last_ms: int) -> list[Finding]:
+        referee = Referee(mirror)
+        for heard in native(mirror, 0, [at * 10 * MS for at in range(100)]):
+            referee.observe(*heard)
+        return referee.finish(last_ms * MS, cut=True)
+
+    assert told(1090) == []  # 990 ms + watchdog
+    assert [(found.kind, found.can_id) for found in told(1120)] == [("silent", 0x100)]
+
+
 def test_robots_of_which_nothing_came(mirror: Plan) -> None:
     plan = plan_of("lab")
     referee = Referee(plan)
@@ -445,6 +457,10 @@ def test_the_log_of_a_run(tmp_path: Path) -> None:
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[: len(lines) // 2]))
     assert judge_log(path, plan).kinds == {"silent": 27}
+    assert judge_log(path, plan, whole=False).kinds == {}  # the run was cut off there
+    path.write_text("")
+    assert judge_log(path, plan).kinds == {"missing": 9}
+    assert judge_log(path, plan, whole=False).kinds == {}
     with pytest.raises(OSError, match="No such file"):
         judge_log(tmp_path / "none.log", plan)
 

@@ -10,18 +10,28 @@ from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.protocols.native.codec import NativeCodec, Torque
 from echelon.bridge.protocols.native.counter import CounterCheck
 from echelon.bridge.protocols.native.host import NativeHost
+from echelon.bridge.protocols.registry import make_host, make_observer
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.torque_mirror import Stop, TorqueMirror
 from echelon.bridge.timing.bus_load import frame_bits
 from echelon.errors import PartRunError
+from echelon.plan.plan import Plan
 from support.bench_drives import drive_plan
+from support.runs import plan_of
 
 MS = 1_000_000
+PROTOCOLS = ("native", "odrive", "cia402")
 CODEC = NativeCodec(0.001)
 
 
 def make() -> TorqueMirror:
     return TorqueMirror([host(0), host(1)], 10 * MS)
+
+
+def mirror_of(plan: Plan) -> TorqueMirror:
+    robots = plan.robots
+    hosts, periods = [make_host(robot) for robot in robots], [robot.period_ns for robot in robots]
+    return TorqueMirror(hosts, periods, [robot.envelope for robot in robots])
 
 
 def host(robot: int) -> NativeHost:
@@ -74,7 +84,33 @@ def test_torque_that_is_not_finite_stops_the_drives(torques: tuple[float, float]
     assert decode(bridge.encode(10 * MS, 1, *torques)) == said(1, 0.0, 0.0, False, 1)
     assert bridge.counts[1].stopped == {Stop.NOT_FINITE: 1}
     assert (bridge.counts[1].smallest, bridge.counts[1].largest) == ((5.0, 5.0), (5.0, 5.0))
-    assert decode(bridge.encode(20 * MS, 1, 2.0, 2.0)) == said(1, 2.0, 2.0, True, 2)
+    assert decode(bridge.encode(20 * MS, 1, 2.0, 2.0)) == said(1, 0.0, 0.0, True, 2)
+    assert decode(bridge.encode(30 * MS, 1, 2.0, 2.0)) == said(1, 2.0, 2.0, True, 3)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_first_torque_after_a_stop_is_zero_and_limits_count_from_there(protocol: str) -> None:
+    plan = plan_of("lab", f"robot.drive.protocol={protocol}", "robot.envelope.rise_limit=0.5")
+    robot, mirror = plan.robots[0], mirror_of(plan)
+    observer = make_observer(robot, False)
+    heard: list[float | None] = []
+    for step, torque in enumerate((0.4, 1.3, 0.4, 0.6, 0.3, math.nan, 0.8, 0.5, 0.5, 0.9)):
+        for frame in mirror.encode(step * 10 * MS, 0, torque, torque):
+            assert observer.observe(step * 10 * MS, frame) == []
+        heard.append(observer.wheels[0].commanded)
+    # 1.3 rises by too much, so 0.4 is replaced by zero, and then 0.6 rises by too much; so does 0.8
+    assert heard == pytest.approx([0.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.9], abs=1e-3)
+    assert mirror.counts[0].stopped == {"rise limit": 3, "not finite": 1}
+
+
+def test_the_first_torque_after_frames_that_no_bus_took_is_zero() -> None:
+    bridge = make()
+    bridge.encode(0, 0, 1.0, 1.0)
+    bridge.stop(0)
+    bridge.encode(10 * MS, 0, 1.0, 1.0)  # enables with zero torque, but reaches no drive
+    bridge.unsent(0)
+    assert decode(bridge.encode(20 * MS, 0, 1.0, 1.0)) == said(0, 0.0, 0.0, True, 3)
+    assert decode(bridge.encode(30 * MS, 0, 1.0, 1.0)) == said(0, 1.0, 1.0, True, 4)
 
 
 def test_old_torque_stops_the_drives_and_a_repeated_one_gives_nothing() -> None:
@@ -118,7 +154,7 @@ torques = st.floats(allow_nan=True, allow_infinity=True)
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 1), torques, torques, st.booleans())))
 def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> None:
     bridge = make()
-    checks = [CounterCheck(), CounterCheck()]
+    checks, disabled = [CounterCheck(), CounterCheck()], [False, False]
     total = 0
     for time, robot, right, left, saturated in calls:
         for can_id, data, _ in bridge.encode(time * 10 * MS, robot, right, left, saturated):
@@ -129,6 +165,8 @@ def test_whatever_comes(calls: list[tuple[int, int, float, float, bool]]) -> Non
             assert frame.enable_right == frame.enable_left
             assert frame.enable_right or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
             assert not frame.enable_right or (math.isfinite(right) and math.isfinite(left))
+            assert not (disabled[robot] and frame.enable_right) or (frame.tau_right, frame.tau_left) == (0.0, 0.0)
+            disabled[robot] = not frame.enable_right
             total += 1
     assert total == bridge.frames == sum(counts.frames for counts in bridge.counts)
     assert total + sum(counts.repeated for counts in bridge.counts) == len(calls)

@@ -14,8 +14,10 @@ from subprocess import CompletedProcess
 
 import pytest
 
+from echelon.bridge.can.canlog import EPOCH_NS
 from echelon.bridge.can.log_files import frames_in
 from echelon.cli import main
+from echelon.cli.judging import judge_run
 from echelon.planning.loading import ScenarioError
 from echelon.sim.parts.loading import load, parse
 from echelon.sim.parts.time_limit import TookTooLong, time_limit
@@ -263,6 +265,21 @@ def wheels_are_at_zero(folder: Path, way: str) -> None:
         assert signals["enable_right"] == signals["enable_left"] == 0, name
 
 
+def the_stop_is_no_finding(folder: Path) -> None:
+    """Checks that the run judged the frames before its own stop of the wheels, and no later ones, as `echelon referee` does."""
+    can = summary_of(folder)["can"]
+    if can is None:  # the bridge gave no report in time
+        return
+    stop_ns, until_s = round(can["wheels_stopped"] * 1e9), can["referee"]["until"]
+    times_ns = [time_ns - EPOCH_NS for time_ns, _, _ in frames_in(folder / "can.log")]
+    assert can["referee"]["later"] == sum(time_ns >= stop_ns // 1000 * 1000 for time_ns in times_ns)
+    assert can["referee"]["source"] == "can.log"
+    plan = parse((folder / "scenario.toml").read_text(), "scenario.toml", (), folder)[1]
+    again = judge_run(plan, folder)
+    assert (again.kinds, again.until, again.later) == (can["referee"]["kinds"], until_s, can["referee"]["later"])
+    assert "silent" not in again.kinds
+
+
 def broken_off(folder: Path, said: str) -> Trace:
     """Checks that the summary of a run names what ended it, and agrees with the recording; returns what was recorded."""
     summary, failure = summary_of(folder), said.removeprefix("echelon: ")
@@ -297,6 +314,7 @@ def test_a_part_that_fails_in_a_run_ends_it_by_name(folder: Path, kind: str, way
     assert len(broken_off(folder / "run", said).common_ns()) > 5
     assert echelon("report", folder / "run").returncode == 0
     wheels_are_at_zero(folder / "run", way)
+    the_stop_is_no_finding(folder / "run")
 
 
 def test_why_a_run_broke_off_is_said_though_its_summary_cannot_be_written(

@@ -5,11 +5,13 @@ import json
 import signal
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from echelon.bridge.can.bus import open_bus
+from echelon.bridge.can.canlog import EPOCH_NS
 from echelon.bridge.can.log_files import frames_in
 from echelon.bridge.protocols.cyclic import WheelState
 from echelon.bridge.protocols.frame import Frame
@@ -196,6 +198,30 @@ def test_a_log_that_was_tampered_with(folder: Path, tmp_path: Path, capsys: pyte
     assert "104  g2/r5 gap: " in first + second
     assert "104  g2/r5 counter gap: 1 frames missing" in first + second
     assert verdict.endswith("2 findings: counter gap 1, gap 1")
+
+
+@pytest.mark.parametrize(
+    "facts", [{"run": {"failure": "x"}, "can": {"referee": {"until": 0.5}}}, {"run": {"clock": "wall"}, "can": None}]
+)
+def test_what_a_run_sends_at_its_end_is_shown_and_not_judged(
+    facts: dict[str, Any], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run broke off at 0.5 s, or it ends there; after that nothing is heard for 0.3 s."""
+    scenario = (folder / "scenario.toml").read_text()
+    (tmp_path / "scenario.toml").write_text(scenario.replace("duration = 1.0", "duration = 0.5", 1))
+    (tmp_path / "summary.json").write_text(json.dumps(facts))
+    lines = [
+        (float(line.partition(")")[0][1:]) - EPOCH_NS / 1e9, line)
+        for line in (folder / "can.log").read_text().splitlines(keepends=True)
+    ]
+    lines = [(at_s, line) for at_s, line in lines if at_s < 0.501 or at_s > 0.8]
+    (tmp_path / "can.log").write_text("".join(line for _, line in lines))
+    assert main(["can", str(tmp_path), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert (data["kinds"], data["frames"]) == ({}, len(lines))
+    assert main(["referee", str(tmp_path), "--json"]) == 0
+    judged = json.loads(capsys.readouterr().out)
+    assert (judged["kinds"], judged["frames"]) == ({}, sum(at_s <= 0.5 for at_s, _ in lines))
 
 
 def test_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,7 +52,12 @@ class RunOptions(ScenarioOptions):
     )
     stall_timeout: float = field(
         default=30.0,
-        metadata=option("in virtual time: give up a run that makes no progress for S seconds", "S", parse=seconds),
+        metadata=option(
+            "give up a run that makes no progress for S seconds; on a wall clock, one in which a robot, leader or coordinator "
+            "stands still for so long",
+            "S",
+            parse=seconds,
+        ),
     )
 
 

@@ -403,13 +403,21 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     wheels_are_at_zero(folder / "run", way)
 
 
-def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_is_named_at_the_end(folder: Path) -> None:
+def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_ends_the_run_after_the_stall_timeout(
+    folder: Path,
+) -> None:
     use = write(folder, "law", f"{LATER['law']}\n            {HANG}")
-    done = run(folder, use, *WAYS["processes, wall clock, closed"], "--set", "can.watchdog=0.1")
+    options = ("--set", "can.watchdog=0.1", "--set", "duration=1000", "--stall-timeout", "2")
+    done = run(folder, use, *WAYS["processes, wall clock, closed"], *options)
     assert done.returncode == 3
-    assert "not done after 14 s: g2, which runs mine.py:Mine" in done.stderr
+    named = [line for line in done.stderr.splitlines() if "leader g2 stands still, for " in line]
+    assert all("which runs mine.py:Mine)" in line for line in named)
+    assert len(named) > 1  # soon, and at the end
+    assert done.stderr.strip().endswith(": longer than the stall timeout of 2 s")
     wheels_are_at_zero(folder / "run", "closed")
-    assert summary_of(folder / "run")["can"]["robots"]["g2/r5"]["stopped"]["no command"] > 10
+    summary = summary_of(folder / "run")
+    assert summary["simulated"] < 500
+    assert summary["can"]["robots"]["g2/r5"]["stopped"]["no command"] > 10
 
 
 def test_a_part_that_cannot_be_made_ends_a_run_in_a_line(folder: Path) -> None:

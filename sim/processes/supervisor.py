@@ -63,7 +63,7 @@ class Supervisor:
     (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
     five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up; one that is not recorded
     shows no progress, and must be over by then.  One on a wall clock is given up if a member stands still for as long.  With
-    `keep_going` the run does not stop when a robot's state is not finite.
+    `keep_going` the run does not stop when a robot has diverged.
     With `observe` it is open to observers, who get the `ticket`.  `interrupted` notes the signals that ask the run to end;
     without it the supervisor notes them itself.  On a wall clock only the messages of one instant in every `every_ns` are
     recorded, if it is given (`sim.wall_load`).  `order` may change the order in which processes start."""

@@ -158,9 +158,10 @@ from echelon import Trajectory
 
 class Circle(Trajectory):
     factor: float = 1.0
+    rate: float = 0.4
 
     def at(self, t):
-        k, turn = 0.4, np.array([0.0, np.pi / 2])
+        k, turn = self.rate, np.array([0.0, np.pi / 2])
         return np.array([np.sin(k * t + turn), self.factor * k * np.cos(k * t + turn), -k * k * np.sin(k * t + turn)])
 
 class Shake(Trajectory):
@@ -181,6 +182,20 @@ class Corners(Trajectory):
         x, v = (s, 1.0) if even else (self.every - s, -1.0)
         return np.array([[x, 0.0], [v, 0.0], [0.0, 0.0]])
 
+class Table(Circle):
+    step: float
+
+    def at(self, t):
+        number, part = divmod(t, self.step)
+        before, after = (super(Table, self).at(at * self.step) for at in (number, number + 1))
+        return before + part / self.step * (after - before)
+
+class Tight(Circle):
+    share: float
+
+    def at(self, t):
+        return super().at(t) * np.array([[1.0], [1.0], [self.share]])
+
 class Flat(Circle):
     def at(self, t):
         return super().at(t) * np.array([[1.0], [1.0], [0.0]])
@@ -197,6 +212,11 @@ def uses_slope(folder: Path, name: str, parameters: str = "") -> str:
     [
         ("Circle", "factor=4.0", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 1.55 against"),
         ("Circle", "factor=0.0", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 0 against"),
+        ("Circle", "factor=1.01", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 0.392 against"),
+        ("Circle", "factor=0.98,rate=17.6", "velocity is not the derivative of position"),  # as over steps of 0.1 s
+        ("Circle", "factor=0.98", "velocity is not the derivative of position"),
+        ("Table", "factor=1.02,step=0.1", "velocity is not the derivative of position"),
+        ("Tight", "share=0.95", "acceleration is not the derivative of velocity"),
         ("Flat", "", "acceleration is not the derivative of velocity (in y 0 against -0.155 m/s²)"),
     ],
 )  # fmt: skip
@@ -208,9 +228,19 @@ def test_a_velocity_that_is_no_derivative_is_a_mistake(folder: Path, name: str, 
 
 @pytest.mark.parametrize(
     ("name", "parameters"),
-    [("Circle", ""), ("Shake", ""), ("Slow", ""), *(("Corners", f"every={every}") for every in (0.05, 0.1, 1.0, 7.0))],
+    [
+        ("Circle", ""),
+        ("Circle", "factor=1.001"),
+        ("Shake", ""),
+        ("Slow", ""),
+        ("Table", "step=0.1"),
+        ("Table", "step=0.02"),
+        *(("Corners", f"every={every}") for every in (0.05, 0.1, 1.0, 7.0)),
+    ],
 )
-def test_honest_trajectories_may_be_fast_slow_and_have_corners(folder: Path, name: str, parameters: str) -> None:
+def test_honest_trajectories_may_be_fast_slow_from_a_table_and_have_corners(
+    folder: Path, name: str, parameters: str
+) -> None:
     load(folder / "mine.toml", [uses_slope(folder, name, parameters)])
 
 

@@ -109,7 +109,7 @@ def run(
     replace     delete the run of another scenario that is in `out`
     report      write report.html
     quiet       show no progress on standard error
-    keep_going  go on when a robot's state is not finite, instead of stopping there
+    keep_going  go on when a robot has diverged, instead of stopping there
 
     A run that broke off, or whose verdict is FAILS, is returned as well: see its `failure` and `verdict`.  Raises UserError for
     a wrong scenario and for options that contradict each other, and OSError if a file cannot be written."""

@@ -70,10 +70,10 @@ def execute(
 
     `plan` is the plan of `scenario`, `out` the locked folder.  `engine` is `processes` or `inprocess`, `clock` is `virtual` or
     `wall`.  `can_urls` has a URL for each bus, or none if the run makes no frames.  A run in virtual time without progress for
-    `stall_timeout_s` is given up.  A run ends at the first instant at which a robot's state is not finite, unless
-    `keep_going` is True.  With `observe`, others can read the messages of a run as processes while it goes on.  `interrupted`
-    notes the signals that ask the run to end; without it this function notes them itself.  A run that breaks off has its reason
-    in the summary; its exception is not raised.
+    `stall_timeout_s` is given up, and one on a wall clock with a member that stands still for as long.  A run ends at the first
+    instant at which a robot has diverged, unless `keep_going` is True.  With `observe`, others can read the messages
+    of a run as processes while it goes on.  `interrupted` notes the signals that ask the run to end; without it this function
+    notes them itself.  A run that breaks off has its reason in the summary; its exception is not raised.
 
     Raises OSError if a file cannot be written, with a note if the run broke off, too; in one process also OSError or ValueError
     if a bus cannot be opened."""

@@ -44,7 +44,10 @@ class RunOptions(ScenarioOptions):
     quiet: bool = field(default=False, metadata=option("show no progress while the run goes on"))
     no_report: bool = field(default=False, metadata=option("do not write report.html"))
     keep_going: bool = field(
-        default=False, metadata=option("go on when a robot's state is not finite; without it the run stops there")
+        default=False,
+        metadata=option(
+            "go on when a robot has diverged (far beyond its reach, or not finite); without it the run stops there"
+        ),
     )
     observe: bool = field(
         default=False,
@@ -52,7 +55,12 @@ class RunOptions(ScenarioOptions):
     )
     stall_timeout: float = field(
         default=30.0,
-        metadata=option("in virtual time: give up a run that makes no progress for S seconds", "S", parse=seconds),
+        metadata=option(
+            "give up a run that makes no progress for S seconds; on a wall clock, one in which a robot, leader or coordinator "
+            "stands still for so long",
+            "S",
+            parse=seconds,
+        ),
     )
 
 

@@ -148,7 +148,7 @@ class PacedRunner(Runner):
         self._inbox.receive(message, time.monotonic_ns() - self._start_ns if self._started else message.time_ns)
 
     def _go_on(self) -> None:
-        if self._started and self._failure is None:
+        if self._started and self._failure is None and not self._finished:  # its pulse rests then
             self._step()
 
     def _write_arrivals(self, after_ns: int) -> None:

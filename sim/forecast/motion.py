@@ -2,6 +2,9 @@
 
 The motion is computed for points that follow the desired accelerations exactly, over ideal links, in the first `STEPS` periods.
 
+If a robot leaves its reach (`sim.parts.reach`), the computed motion diverges.  Then its speeds say nothing, and only those of
+the trajectory count.
+
 *Torque* at the start: by the inverse dynamics of docs/architecture.md, 2.1, for a robot at rest with its own heading.
 
 *Wheel speed*: a robot that moves straight ahead at |v| turns its wheels at |v|/r; in a turn one wheel is faster.
@@ -20,7 +23,9 @@ from echelon.controller.laws.central import CentralLaw
 from echelon.controller.trajectory import make_trajectory, sample
 from echelon.errors import PartRunError
 from echelon.plan.plan import Array, Plan, RobotPlan
+from echelon.runtime.admission import LARGEST
 from echelon.sim.forecast.torque_loop import torque_loops
+from echelon.sim.parts.reach import Reach
 
 STEPS: Final = 1000
 """Number of periods for which the motion is computed"""
@@ -37,7 +42,9 @@ class Asked:
     accelerations: Array
     """Accelerations at the start, (N, 2) [m/s²]"""
     speeds: Array
-    """Largest speeds, of the computed motion or of the trajectory, (N,) [m/s]"""
+    """Largest speeds, of the computed motion or of the trajectory, (N,) [m/s]; of the latter alone if the motion diverges"""
+    diverges_s: float | None = None
+    """When the computed motion has diverged [s]; None if it does not"""
 
 
 def asked_of(plan: Plan) -> Asked:
@@ -47,7 +54,8 @@ def asked_of(plan: Plan) -> Asked:
     positions, velocities = np.array([robot.start for robot in plan.robots]), np.zeros((len(plan.robots), 2))
     times = np.linspace(0.0, plan.duration_ns * 1e-9, INSTANTS)
     travel = np.linalg.norm(sample(make_trajectory(plan.trajectory), times)[:, 1], axis=1).max()
-    speeds = np.full(len(plan.robots), travel)
+    still = np.full(len(plan.robots), travel)
+    speeds, reach = still, Reach(plan)
     first = None
     with np.errstate(all="ignore"):
         for step in range(min(STEPS, plan.duration_ns // round(T * 1e9))):
@@ -55,8 +63,10 @@ def asked_of(plan: Plan) -> Asked:
             first = a if first is None else first
             positions, velocities = positions + T * velocities + T**2 / 2 * a, velocities + T * a
             speed = np.linalg.norm(velocities, axis=1)
-            if not np.isfinite(speed).all():
-                break
+            after_s = (step + 1) * T
+            far = np.linalg.norm(positions - (reach.x, reach.y), axis=1).max()
+            if not (far <= reach.at(round(after_s * 1e9)) and np.isfinite(speed).all()):
+                return Asked(first, still, after_s)
             speeds = np.maximum(speeds, speed)
     return Asked(velocities if first is None else first, speeds)
 
@@ -72,16 +82,23 @@ def motion_warnings(plan: Plan) -> list[str]:
     beyond = [at for at, robot in enumerate(plan.robots) if not torques[at] <= robot.torque_limit]
     if beyond:
         worst = max(beyond, key=lambda at: torques[at] / plan.robots[at].torque_limit)
+        most = f"{torques[worst]:.3g} N m" if torques[worst] <= LARGEST else "more torque than there can be"
         found.append(
-            f"torque_limit = {plan.robots[worst].torque_limit:g}: the start asks {torques[worst]:.3g} N m of a wheel of "
+            f"torque_limit = {plan.robots[worst].torque_limit:g}: the start asks {most} of a wheel of "
             f"{_named(plan, worst, len(beyond))}"
+        )
+    if asked.diverges_s is not None:
+        found.append(
+            f"law: the motion that is computed for ideal links diverges within {asked.diverges_s:.3g} s; "
+            "what it asks of wheels is not said"
         )
     rates = [speed / robot.wheel_radius for speed, robot in zip(asked.speeds.tolist(), plan.robots, strict=True)]
     beyond = [at for at, robot in enumerate(plan.robots) if rates[at] > robot.wheel_speed_limit]
     if beyond:
         worst = max(beyond, key=lambda at: rates[at] / plan.robots[at].wheel_speed_limit)
+        who = "start and trajectory ask" if asked.diverges_s is None else "the trajectory asks"
         found.append(
-            f"wheel_speed_limit = {plan.robots[worst].wheel_speed_limit:g}: start and trajectory ask {rates[worst]:.3g} rad/s "
+            f"wheel_speed_limit = {plan.robots[worst].wheel_speed_limit:g}: {who} {rates[worst]:.3g} rad/s "
             f"({asked.speeds[worst]:.3g} m/s) of {_named(plan, worst, len(beyond))}"
         )
     return [*found, *torque_loop_warnings(plan, asked)]

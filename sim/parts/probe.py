@@ -28,13 +28,15 @@ INSTANTS_S: Final = 0.5
 """Time limit for trying a trajectory at its instants [s]; the comparison of its derivatives has as much again"""
 SLOPES: Final = 25
 """Number of instants at which the derivatives of a trajectory are compared with its differences"""
-SLOPE_STEP_S: Final = 1e-3
-"""Central differences use values at this time before and after an instant [s]"""
-SLOPE_TOLERANCE: Final = 0.1
-"""Largest difference that is allowed, as a fraction of the derivative's largest value; `SLOPE_FLOOR` is added to it.  A wrong
-derivative usually differs by more.  A correct one differs by far less, except at corners of the path"""
-SLOPE_FLOOR: Final = 1e-3
+SLOPE_STEPS_S: Final = (1e-3, 1e-2, 1e-1)
+"""Differences use values up to one of these times before and after an instant [s]; long ones even out the steps of a table"""
+SLOPE_TOLERANCE: Final = 0.005
+"""Largest difference that is allowed, as a fraction of the derivative's largest value; `SLOPE_FLOORS` is added to it"""
+SLOPE_FLOORS: Final = np.array([[1e-4], [1e-3]])
 """Difference that is always allowed [m/s for velocities, m/s² for accelerations]"""
+SLOPE_TRUST: Final = 0.05
+"""Differences over half a step and over the whole step may differ by this fraction of the derivative's largest value; if they
+differ by more, a step longer than the first is too long for the path"""
 _T = TypeVar("_T")
 
 
@@ -68,33 +70,52 @@ def _probe_trajectory(plan: Plan) -> None:
 
 
 def _probe_slopes(use: str, trajectory: Desired, end_s: float) -> None:
-    """Compares velocity and acceleration with central differences of position and velocity.
+    """Compares velocity and acceleration with differences of position and velocity, over a short step and over longer ones.
 
-    Raises PartRunError if they differ at half of the instants or more; at a few instants a correct path may differ, too, since
-    it may have corners there."""
-    step_s, begun_s = min(SLOPE_STEP_S, end_s / 100), time.monotonic()
-    times, given, found = [], [], []
-    for number in range(SLOPES):
+    Raises PartRunError if they differ at half of the instants or more, whatever the step is; at a few instants a correct path
+    may differ, too, since it may have corners there."""
+
+    def ask(t: float) -> Array:
+        return _asked(f"{use}: at({t:g})", partial(trajectory.at, t))
+
+    begun_s = time.monotonic()
+    times = [(number + 0.382) / SLOPES * end_s for number in range(SLOPES)]  # between round numbers, where corners are
+    given, found = [], []
+    for number, t in enumerate(times):
         if number and time.monotonic() - begun_s > INSTANTS_S:
             break
-        t = (number + 0.382) / SLOPES * end_s  # between round numbers, where paths have their corners
-        ask = (partial(trajectory.at, at) for at in (t - step_s, t, t + step_s))
-        before, now, after = (_asked(f"{use}: at({t:g})", one) for one in ask)
-        times.append(t)
-        given.append(now[1:] + 0.0)  # turns -0.0 into 0.0 for the message
-        found.append((after - before)[:2] / (2 * step_s))
+        given.append(ask(t)[1:] + 0.0)  # turns -0.0 into 0.0 for the message
+        found.append(_slopes(ask, t, min(SLOPE_STEPS_S[0], end_s / 100))[0])
+    largest = np.abs(given).max(axis=(0, 2))[:, np.newaxis]
+    bound = SLOPE_FLOORS + SLOPE_TOLERANCE * largest
     wrong = np.abs(np.array(given) - found)  # (instants, 2, 2): velocity and acceleration, x and y
-    largest = np.abs(given).max(axis=(0, 2))
-    too_far = wrong > SLOPE_FLOOR + SLOPE_TOLERANCE * largest[:, np.newaxis]
+    for step_s in SLOPE_STEPS_S[1:]:
+        at_fault = np.flatnonzero((wrong > bound).any(axis=(1, 2)))
+        if 2 * len(at_fault) < len(given):
+            return
+        for number in at_fault.tolist():
+            if time.monotonic() - begun_s > 2 * INSTANTS_S:
+                break
+            slopes, doubt = _slopes(ask, times[number], min(step_s, end_s / 100))
+            missed = np.where(doubt > SLOPE_FLOORS + SLOPE_TRUST * largest, np.inf, np.abs(given[number] - slopes))
+            wrong[number] = np.minimum(wrong[number], missed)
+    too_far = wrong > bound
     for row, (what, of, unit) in enumerate((("velocity", "position", "m/s"), ("acceleration", "velocity", "m/s²"))):
         instants = np.flatnonzero(too_far[:, row].any(axis=1))
-        if 2 * len(instants) >= len(times):
+        if 2 * len(instants) >= len(given):
             at = instants[0]
             axis = int(wrong[at, row].argmax())
             raise PartRunError(
                 f"{use}: at t = {times[at]:.3g} s: {what} is not the derivative of {of} "
                 f"(in {'xy'[axis]} {given[at][row, axis]:.3g} against {found[at][row, axis]:.3g} {unit})"
             )
+
+
+def _slopes(ask: Callable[[float], Array], t: float, step_s: float) -> tuple[Array, Array]:
+    """Returns the derivatives of position and velocity at `t`, (2, 2), of the fourth order in the step, and by how much
+    differences over half the step and over the whole step differ."""
+    whole, half = ((ask(t + h) - ask(t - h))[:2] / (2 * h) for h in (step_s, step_s / 2))
+    return (4 * half - whole) / 3, np.abs(half - whole)
 
 
 def _probe_law(plan: Plan) -> None:

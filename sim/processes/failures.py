@@ -24,7 +24,7 @@ class StallError(RunError):
 
 
 class DivergedError(Exception):
-    """A robot's state is not finite, so the run stops; the text names the robot and the instant."""
+    """A robot has diverged, so the run stops; the text names the robot and the instant."""
 
 
 def few(names: Sequence[str], between: str = ", ") -> str:

@@ -3,12 +3,13 @@
 On a wall clock a process that stands still, or is slow, is known by its pulse (`pulse`): it is not at work when it said it
 would be.  A bridge or drives that stand still for `BREAK_S` break the run off, for the watchdogs of the drives have stopped
 the wheels for good; where the drives recover, for `RECOVER_S`.  Others are named, the run goes on without them, and the check
-`standstill` fails the verdict.
+`standstill` fails the verdict.  A robot, leader or coordinator that stands still for the stall timeout ends the run.
 
 In virtual time every member waits for the messages of others, so one process that stands still stops all.  A member that waits
 says so every now and then; a member that says nothing is the one that everyone waits for, or a watcher without a pulse.
 """
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Final
@@ -37,8 +38,11 @@ ASLEEP_S: Final = 0.4
 class StandstillWatch:
     """Watches the processes of one run on a wall clock."""
 
-    def __init__(self, plan: Plan, children: Sequence[Child], progress: Progress) -> None:
+    def __init__(
+        self, plan: Plan, children: Sequence[Child], progress: Progress, stall_timeout_s: float = math.inf
+    ) -> None:
         self._plan, self._children, self._progress = plan, children, progress
+        self._stall_timeout_s = stall_timeout_s
         recover = all(robot.drive.recover_ns is not None for robot in plan.robots)
         self._break_s = RECOVER_S if recover else BREAK_S
         self._named: set[str] = set()
@@ -48,7 +52,7 @@ class StandstillWatch:
         """Notes in the progress which processes stand still; call it some times a second while the run goes on.
 
         `now_ns` is on the monotonic clock.  Raises RunError if the bridge or the drives do for `BREAK_S`, or
-        `RECOVER_S`."""
+        `RECOVER_S`, or a member of the run for the stall timeout."""
         asleep, self._looked_ns = now_ns - self._looked_ns > ASLEEP_S * 1e9, now_ns
         if asleep or now_ns < self._progress.started_s * 1e9:
             return  # all processes get the time to go on; before run time 0 no wheel has torque yet
@@ -69,6 +73,10 @@ class StandstillWatch:
                 raise RunError(
                     f"{self._text(child, overdue_s[child.name])}: longer than the watchdogs of the drives allow"
                 )
+        given_up = [child for child in still if child.is_member and overdue_s[child.name] > self._stall_timeout_s]
+        if given_up:
+            who = few([self._text(child, overdue_s[child.name]) for child in given_up], "; ")
+            raise RunError(f"{who}: longer than the stall timeout of {self._stall_timeout_s:g} s")
 
     def _text(self, child: Child, still_s: float) -> str:
         """Returns in words how long a process has stood still, since when, and what the kernel says of it."""

@@ -62,7 +62,8 @@ class Supervisor:
     clock.  `can_urls` has a URL for each bus; without it there are no frames.  `scenario_toml`, `metadata` and `part_files`
     (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
     five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up; one that is not recorded
-    shows no progress, and must be over by then.  With `keep_going` the run does not stop when a robot's state is not finite.
+    shows no progress, and must be over by then.  One on a wall clock is given up if a member stands still for as long.  With
+    `keep_going` the run does not stop when a robot has diverged.
     With `observe` it is open to observers, who get the `ticket`.  `interrupted` notes the signals that ask the run to end;
     without it the supervisor notes them itself.  On a wall clock only the messages of one instant in every `every_ns` are
     recorded, if it is given (`sim.wall_load`).  `order` may change the order in which processes start."""
@@ -101,7 +102,7 @@ class Supervisor:
         self._children: list[Child] = []
         self._hearing = Hearing(plan, self._children, self.progress)
         self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)
-        self._still = StandstillWatch(plan, self._children, self.progress)
+        self._still = StandstillWatch(plan, self._children, self.progress, stall_timeout_s)
         self._asked, self._startup_s = interrupted, 0.0
 
     def run(self) -> Outcome:

@@ -8,6 +8,7 @@ from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
+from echelon.sim.parts.reach import DIVERGED
 from echelon.sim.results.trace import Array, Trace
 
 
@@ -47,14 +48,20 @@ class LinksProgress:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The first state that is not finite, or beyond all bounds: of which robot (its index), and when."""
+    """The first state that is not finite, or beyond all bounds, or of a robot beyond its reach: of which robot (its index), and
+    when."""
 
     robot: int
     time_ns: int
     finite: bool = False
+    far: float | None = None
+    """How far the robot is from where the trajectory begins, if that is beyond its reach (`sim.parts.reach`) [m]"""
 
     def text(self, plan: Plan) -> str:
         """Returns it in words."""
+        if self.far is not None:
+            who, when = plan.robots[self.robot].name, f"{self.time_ns / 1e9:g} s"
+            return f"{who} has diverged: at {when} it is {self.far:.3g} m from where the trajectory begins, {DIVERGED}"
         what = "beyond all bounds" if self.finite else "not finite"
         return f"the state of {plan.robots[self.robot].name} is {what} from {self.time_ns / 1e9:g} s on"
 

@@ -22,6 +22,7 @@ from echelon.runtime.admission_rules import admissions_of
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Session
 from echelon.runtime.wire import WireError, split
+from echelon.sim.parts.reach import ReachWatch
 from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet, tell, watch_keys
 from echelon.sim.processes.to_supervisor import Lost, RecorderProgress, RecorderReport
 from echelon.sim.processes.watch import Watch
@@ -171,7 +172,8 @@ class RunRecorder:
     With `every_ns` only the first message of each source and channel in every such time is recorded; frames all are.
 
     Both end with the first instant at which a robot's state is not finite or beyond all bounds (`admission.within`), since soon
-    after that no state is finite.  With `keep_going` they go on to the end."""
+    after that no state is finite, or at which a robot is beyond its reach (`sim.parts.reach`).  With `keep_going` they go on to
+    the end."""
 
     def __init__(
         self,
@@ -192,16 +194,21 @@ class RunRecorder:
         self._trace = TraceBuilder(plan)
         self.messages = 0
         self.lost: Lost | None = None
-        """The first state that is not finite, or beyond all bounds"""
+        """The first state that is not finite, or beyond all bounds, or of a robot beyond its reach"""
         self._time_ns = 0
         self._bridge = len(plan.formation)
-        self._keep_going = keep_going
+        self._reach = None if keep_going else ReachWatch(plan)
 
     def add(self, messages: Sequence[Message]) -> None:
         """Takes messages in order of time."""
         recorder, trace = self.recorder, self._trace
-        if self.lost is None and not self._keep_going:
+        if self.lost is None and self._reach is not None:
             self.lost = _first_lost(messages)
+            if (beyond := self._reach.first(messages)) is not None and (
+                self.lost is None or beyond[1] < self.lost.time_ns
+            ):
+                robot, time_ns, far = beyond
+                self.lost = Lost(robot, time_ns, True, far)
         if self.lost is not None:
             last_ns = self.lost.time_ns
             messages = [message for message in messages if message.time_ns <= last_ns]

@@ -147,8 +147,11 @@ def prepare(request: Request) -> Prepared:
 
 def unstable(plan: Plan) -> str | None:
     """Returns why a plan cannot settle; None if it does, or if nothing exact can be said."""
-    if torque_loop_diverges(plan, asked_of(plan)):
+    asked = asked_of(plan)
+    if torque_loop_diverges(plan, asked):
         return "the torque loop of a robot diverges (echelon validate says which)"
+    if asked.diverges_s is not None:
+        return f"its motion diverges within {asked.diverges_s:.3g} s (echelon validate)"
     try:
         if untreated(plan) or (radius := spectral_radius(LinearRun(plan).map())) < 1:
             return None

@@ -90,6 +90,7 @@ def run_slowly(
     """Runs a role in a slow process, and notes its arrivals; returns its acts and its runner."""
     clock, coming = SlowClock(luck, stall_ns), coming_to(plan, index, luck)
     acts: list[Act] = []
+    beats: list[int] = []
     takes: dict[str, Callable[[bytes], None]] = {}
     paths = [one.path for one in plan.all_roles]
     session: Any = SimpleNamespace(
@@ -108,13 +109,20 @@ def run_slowly(
         else:
             clock.now_ns = max(clock.now_ns, until_ns)
 
+    def beat(now_ns: int, due_ns: int) -> None:
+        beats.append(due_ns)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(echelon.runtime.paced, "time", clock)
         patch.setattr(PacedRunner, "_rest", rest)
         role = noting(make_role(plan, index), acts)
-        runner = PacedRunner(role, plan, session, "test", watched=False, arrivals=arrivals)
+        runner = PacedRunner(role, plan, session, "test", watched=False, arrivals=arrivals, beat=beat)
         runner.run(START_NS)
         runner.finish()
+        count = len(beats)
+        for _, message in coming:
+            takes[data_key("test", paths[message.source], message.channel)](encode(message))
+        assert len(beats) == count > 0  # who is done cannot be late
     return acts, runner
 
 

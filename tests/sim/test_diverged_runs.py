@@ -55,6 +55,27 @@ def test_processes_stop_with_the_same_states(in_process: tuple[dict[str, Any], P
     assert min(row["sent"] for row in summary["links"]) > 0  # the counts of links are kept although the run stopped
 
 
+def test_an_error_that_limits_keep_from_growing_exponentially_stops_a_run_at_the_same_instant_in_both_engines(
+    tmp_path: Path,
+) -> None:
+    summaries = []
+    for engine in ("inprocess", "processes"):
+        folder = tmp_path / engine
+        options = ("--set", "law.epsilon=[0.02,0.02]", "--set", "duration=30", *QUIET)
+        done = echelon("run", "lab", "--engine", engine, *options, "--out", folder)
+        assert done.returncode == 1, done.stderr
+        summaries.append(summary_of(folder))
+    one, other = summaries
+    stopped = one["run"]["stopped"]
+    assert f" has diverged: at {one['simulated']:g} s it is " in stopped
+    assert "more than 2 times as far as its start, its place in the formation and the trajectory ask" in stopped
+    assert one["simulated"] < 10
+    assert other["run"]["stopped"] == stopped
+    assert other["trace_digest"] == one["trace_digest"]
+    outcomes = {check["name"]: check["outcome"] for check in one["verdict"]["checks"]}
+    assert (outcomes["whole"], outcomes["finite"]) == ("failed", "passed")
+
+
 @pytest.mark.parametrize("engine", ["inprocess", "processes"])
 def test_the_bus_of_a_stopped_run_is_judged_up_to_the_stop_and_the_cause_is_told_first(
     engine: str, tmp_path: Path

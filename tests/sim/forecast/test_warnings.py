@@ -1,6 +1,7 @@
 """Warnings of `echelon validate`, compared with what runs do, or with numbers that are computed in another way."""
 
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
 from echelon.shipped import shipped
 from echelon.sim.engines.in_process import Engine
-from echelon.sim.forecast.motion import asked_of, torque_loop_diverges, torque_loop_numbers
+from echelon.sim.forecast.motion import asked_of, motion_warnings, torque_loop_diverges, torque_loop_numbers
 from echelon.sim.forecast.warnings import warnings
 from echelon.sim.results.summary import summarise
+from echelon.sim.sweep.preparing import unstable
 from support.runs import plan_of, trace_of
 from support.synthetic import run_facts
 
@@ -176,3 +178,22 @@ def test_the_paper_loses_a_robot_where_its_torque_loop_is_said_to_diverge(torque
     assert finite != lost
     if lost:
         assert "torque loop of g3/r9 (the worst of 6 robots) diverges" in warnings(plan)[-1]
+
+
+def test_a_motion_that_diverges_is_said_with_the_instant_and_without_numbers_that_mean_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plan = plan_of("lab", "law.epsilon=[0.02, 0.02]", "robot.wheel_speed_limit=1.0")
+    said = [line.partition(":")[2].strip() for line in motion_warnings(plan)]
+    assert said == [
+        "the start asks 1.8e+03 N m of a wheel of g3/r9 (the worst of 9 robots)",
+        "the motion that is computed for ideal links diverges within 0.04 s; what it asks of wheels is not said",
+        "the trajectory asks 6 rad/s (0.3 m/s) of g1/r1 (the worst of 9 robots)",
+    ]
+    asked = asked_of(plan)
+    assert asked.diverges_s == pytest.approx(0.04)
+    assert asked.speeds.tolist() == pytest.approx([0.3] * 9)
+    assert unstable(plan) == "its motion diverges within 0.04 s (echelon validate)"
+    assert asked_of(plan_of("lab")).diverges_s is None
+    monkeypatch.setattr("echelon.sim.forecast.motion._start_torque", lambda robot, ax, ay: inf)
+    assert "the start asks more torque than there can be of a wheel of " in motion_warnings(plan)[0]

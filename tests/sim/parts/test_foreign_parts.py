@@ -160,9 +160,10 @@ from echelon import Trajectory
 
 class Circle(Trajectory):
     factor: float = 1.0
+    rate: float = 0.4
 
     def at(self, t):
-        k, turn = 0.4, np.array([0.0, np.pi / 2])
+        k, turn = self.rate, np.array([0.0, np.pi / 2])
         return np.array([np.sin(k * t + turn), self.factor * k * np.cos(k * t + turn), -k * k * np.sin(k * t + turn)])
 
 class Shake(Trajectory):
@@ -183,6 +184,20 @@ class Corners(Trajectory):
         x, v = (s, 1.0) if even else (self.every - s, -1.0)
         return np.array([[x, 0.0], [v, 0.0], [0.0, 0.0]])
 
+class Table(Circle):
+    step: float
+
+    def at(self, t):
+        number, part = divmod(t, self.step)
+        before, after = (super(Table, self).at(at * self.step) for at in (number, number + 1))
+        return before + part / self.step * (after - before)
+
+class Tight(Circle):
+    share: float
+
+    def at(self, t):
+        return super().at(t) * np.array([[1.0], [1.0], [self.share]])
+
 class Flat(Circle):
     def at(self, t):
         return super().at(t) * np.array([[1.0], [1.0], [0.0]])
@@ -199,6 +214,11 @@ def uses_slope(folder: Path, name: str, parameters: str = "") -> str:
     [
         ("Circle", "factor=4.0", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 1.55 against"),
         ("Circle", "factor=0.0", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 0 against"),
+        ("Circle", "factor=1.01", "Circle: at t = 0.611 s: velocity is not the derivative of position (in x 0.392 against"),
+        ("Circle", "factor=0.98,rate=17.6", "velocity is not the derivative of position"),  # as over steps of 0.1 s
+        ("Circle", "factor=0.98", "velocity is not the derivative of position"),
+        ("Table", "factor=1.02,step=0.1", "velocity is not the derivative of position"),
+        ("Tight", "share=0.95", "acceleration is not the derivative of velocity"),
         ("Flat", "", "acceleration is not the derivative of velocity (in y 0 against -0.155 m/s²)"),
     ],
 )  # fmt: skip
@@ -210,9 +230,19 @@ def test_a_velocity_that_is_no_derivative_is_a_mistake(folder: Path, name: str, 
 
 @pytest.mark.parametrize(
     ("name", "parameters"),
-    [("Circle", ""), ("Shake", ""), ("Slow", ""), *(("Corners", f"every={every}") for every in (0.05, 0.1, 1.0, 7.0))],
+    [
+        ("Circle", ""),
+        ("Circle", "factor=1.001"),
+        ("Shake", ""),
+        ("Slow", ""),
+        ("Table", "step=0.1"),
+        ("Table", "step=0.02"),
+        *(("Corners", f"every={every}") for every in (0.05, 0.1, 1.0, 7.0)),
+    ],
 )
-def test_honest_trajectories_may_be_fast_slow_and_have_corners(folder: Path, name: str, parameters: str) -> None:
+def test_honest_trajectories_may_be_fast_slow_from_a_table_and_have_corners(
+    folder: Path, name: str, parameters: str
+) -> None:
     load(folder / "mine.toml", [uses_slope(folder, name, parameters)])
 
 
@@ -421,13 +451,21 @@ def test_a_part_that_hangs_is_found_and_named(folder: Path, kind: str, way: str)
     wheels_are_at_zero(folder / "run", way)
 
 
-def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_is_named_at_the_end(folder: Path) -> None:
+def test_a_part_that_hangs_on_a_wall_clock_stops_its_robots_alone_and_ends_the_run_after_the_stall_timeout(
+    folder: Path,
+) -> None:
     use = write(folder, "law", f"{LATER['law']}\n            {HANG}")
-    done = run(folder, use, *WAYS["processes, wall clock, closed"], "--set", "can.watchdog=0.1")
+    options = ("--set", "can.watchdog=0.1", "--set", "duration=1000", "--stall-timeout", "2")
+    done = run(folder, use, *WAYS["processes, wall clock, closed"], *options)
     assert done.returncode == 3
-    assert "not done after 14 s: g2, which runs mine.py:Mine" in done.stderr
+    named = [line for line in done.stderr.splitlines() if "leader g2 stands still, for " in line]
+    assert all("which runs mine.py:Mine)" in line for line in named)
+    assert len(named) > 1  # soon, and at the end
+    assert done.stderr.strip().endswith(": longer than the stall timeout of 2 s")
     wheels_are_at_zero(folder / "run", "closed")
-    assert summary_of(folder / "run")["can"]["robots"]["g2/r5"]["stopped"]["no command"] > 10
+    summary = summary_of(folder / "run")
+    assert summary["simulated"] < 500
+    assert summary["can"]["robots"]["g2/r5"]["stopped"]["no command"] > 10
 
 
 def test_a_part_that_cannot_be_made_ends_a_run_in_a_line(folder: Path) -> None:

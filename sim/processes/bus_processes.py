@@ -10,7 +10,6 @@ The referee has sockets of its own, and judges what was on the buses.  Without a
 """
 
 import gc
-import os
 import signal
 import threading
 import time
@@ -159,8 +158,8 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch
     if failure is not None:
         say(failure)
         raise SystemExit(1)
-    signal.signal(STOP, lambda number, frame: os._exit(0))
-    finish(spec, control, runner.counts, runner.mailbox.counts(), station.report(), runner.refusals)
+    # Who is ordered to stop the wheels is ordered to end soon after: its report comes first.
+    finish(spec, control, runner.counts, runner.mailbox.counts(), station.report(), runner.refusals, leaves=True)
 
 
 def _tell(station: ClosedBridge | LockstepDrives, say: Callable[[Said], None], done: threading.Event) -> None:

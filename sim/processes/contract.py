@@ -11,6 +11,7 @@ end      the supervisor says `End` when all are done; the process closes its ses
 import os
 import resource
 import select
+import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +29,7 @@ from echelon.runtime.wire import SCHEMA_VERSION, token_key, watch_key
 from echelon.sim.observing import Gate
 from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Ready, Report, Said
-from echelon.sim.processes.watch import Watch
+from echelon.sim.processes.watch import STOP, Watch
 
 FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
 """Kinds of processes that get the order to finish, in this order.  Bridge and drives in lockstep do not need it: they are
@@ -136,13 +137,16 @@ def finish(
     links: Sequence[LinkCounts] = (),
     report: Report | None = None,
     refusals: Refusals | None = None,
+    leaves: bool = False,
 ) -> None:
-    """Sends the counts of this process and waits for `End`.
+    """Sends the counts of this process and waits for `End`; if it `leaves`, `STOP` ends it, too, once they are sent.
 
     A process that closed its session earlier would look dead to its neighbours."""
     cpu_s, memory = resources()
     refused = {} if refusals is None else refusals.by_source()
     control.send(Done(spec.name, cpu_s, memory, runner, tuple(links), report, refused))
+    if leaves:
+        signal.signal(STOP, lambda number, frame: os._exit(0))
     control.recv()
 
 

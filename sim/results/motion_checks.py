@@ -26,7 +26,7 @@ def whole(evidence: Evidence) -> Iterator[CheckResult]:
         yield result("failed", what if " at t = " in what else f"{what} ({at})")
         return
     if run.stopped:
-        yield result("failed", f"the run was stopped {at}")
+        yield result("failed", f"the run was stopped {at}: {run.stopped}")
         return
     # The last instant that all robots share may be one period of the coordinator before the end.
     needed_ns = plan.duration_ns - plan.root.period_ns

@@ -41,7 +41,8 @@ def test_a_diverged_run_stops_at_the_first_state_beyond_all_bounds(in_process: t
     summary, folder = in_process
     checks = {check["name"]: check for check in summary["verdict"]["checks"]}
     assert checks["whole"]["outcome"] == checks["finite"]["outcome"] == "failed"
-    assert checks["whole"]["text"] == f"the run was stopped at {summary['simulated']:g} s of 2 s"
+    stop = f"the run was stopped at {summary['simulated']:g} s of 2 s: {summary['run']['stopped']}"
+    assert checks["whole"]["text"] == stop
     assert summary["simulated"] < 1
     assert f"is beyond all bounds from {summary['simulated']:g} s on" in summary["run"]["stopped"]
     assert summary["run"]["failure"] is None

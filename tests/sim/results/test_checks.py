@@ -313,7 +313,10 @@ def test_where_nothing_was_ever_used_no_age_is_told():
     ("facts", "text"),
     [
         ({"failure": "interrupted"}, "whole: interrupted (at 14.99 s of 20 s)"),
-        ({"stopped": "the state of g1/r1 is not finite from 15 s on"}, "whole: the run was stopped at 14.99 s of 20 s"),
+        (
+            {"stopped": "the state of g1/r1 is not finite from 15 s on"},
+            "whole: the run was stopped at 14.99 s of 20 s: the state of g1/r1 is not finite from 15 s on",
+        ),
     ],
 )
 def test_a_run_that_broke_off_says_why_and_when_once(facts, text):

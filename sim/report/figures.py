@@ -17,10 +17,12 @@ from echelon.sim.report.axes import (
     largest_torques,
     positive,
     radii,
+    shown_distance,
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import INK, Look, Picture, drawable, thin
+from echelon.sim.report.drawing import INK, Look, Picture
+from echelon.sim.report.thinning import thin
 from echelon.sim.report.time_axis import TimeAxis, above
 from echelon.sim.report.trajectory_map import trajectories
 from echelon.sim.results.block_series import Blocks, BlockSeries
@@ -95,7 +97,7 @@ def errors(blocks: Blocks, plan: Plan, width: float) -> Picture:
             if not series.block.size:
                 continue
             look = Look.of_block(plan, series.block)
-            line = time.thin(blocks.times_ns, positive(series.norm))
+            line = time.thin(blocks.times_ns, series.norm, positive)
             axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.3, zorder=3)
             for fraction, face in ((0.05, look.colour), (0.02, "white")):
                 settled = settle(plan, series, blocks.times_ns, fraction).settled_ns
@@ -120,16 +122,15 @@ def smallest_distance(near: Distances, plan: Plan, width: float) -> Picture:
     """Draws the smallest distance of all pairs over time, with avoidance radius, sensing radius and the closest encounter."""
     time = distance_time(near, plan)
     radius, sensing = plan.avoidance.avoidance_radius, plan.avoidance.sensing_radius
-    shown = np.maximum(drawable(near.smallest), radius * 1e-3)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         radii(axes, radius, sensing)
-        axes.plot(*time.thin(near.times_ns, shown), color=INK, lw=1.0, zorder=3)
+        axes.plot(*time.thin(near.times_ns, near.smallest, shown_distance(radius)), color=INK, lw=1.0, zorder=3)
         if near.closest is not None and time.shows(near.closest.time_ns / 1e9):
             at = near.closest.time_ns / 1e9, max(near.closest.distance, radius * 1e-3)
             axes.plot(*at, "o", ms=5, mfc="white", mec=INK, zorder=5, clip_on=False)
-        distance_limits(axes, shown, radius, sensing)
+        distance_limits(axes, [near.smallest], radius, sensing)
         time.apply(axes)
 
     return Picture(width, 2.7, draw)

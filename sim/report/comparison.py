@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ from echelon.sim.report.axes import (
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import Look, Picture
+from echelon.sim.report.drawing import RUNS, Array, Look, Picture
 from echelon.sim.report.thinning import drawable
 from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.report.trajectory_map import Paths
@@ -108,7 +108,7 @@ def _errors(runs: Sequence[Compared], time: TimeAxis) -> Picture:
             for look, (run, by_name) in _looks(zip(runs, series, strict=True)):
                 if name in by_name:
                     line = time.thin(run.blocks.times_ns, by_name[name].norm, positive)
-                    axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2)
+                    axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2, **_marks(line, look, len(runs)))
             axes.set_title(name)
             error_limits(axes, [run.blocks for run in runs])
             time.apply(axes, number >= len(names) - columns)
@@ -128,7 +128,7 @@ def _distance(runs: Sequence[Compared], time: TimeAxis) -> Picture:
         radii(axes, radius, sensing)
         for look, run in _looks(runs):
             line = time.thin(run.near.times_ns, run.near.smallest, shown_distance(radius))
-            axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2)
+            axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2, **_marks(line, look, len(runs)))
         distance_limits(axes, [run.near.smallest for run in runs], radius, sensing)
         time.apply(axes)
         _legend(figure, runs)
@@ -154,7 +154,8 @@ def _torques(runs: Sequence[Compared], time: TimeAxis, scale: TorqueScale) -> Pi
             for look, (run, by_name) in _looks(zip(runs, robots, strict=True)):
                 if name in by_name:
                     times_ns, states = run.trace.times_ns[by_name[name]], run.trace.states[by_name[name]]
-                    axes.plot(*time.thin(times_ns, states[:, TAUS[0]]), color=look.colour, ls=look.dashes, lw=1.0)
+                    line = time.thin(times_ns, states[:, TAUS[0]])
+                    axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.0, **_marks(line, look, len(runs)))
             axes.set_title(name)
             time.apply(axes, number >= len(names) - columns)
         for row in grid:
@@ -162,6 +163,14 @@ def _torques(runs: Sequence[Compared], time: TimeAxis, scale: TorqueScale) -> Pi
         _legend(figure, runs)
 
     return Picture(WIDTH, 1.35 * -(-len(names) // columns) + 0.8, draw)
+
+
+def _marks(line: tuple[Array, Array], look: Look, runs: int) -> dict[str, Any]:
+    """Returns what gives the line of a run its marks, apart from those of the other runs; nothing for an empty line."""
+    if not np.isfinite(line[1]).any():  # matplotlib marks no empty line
+        return {}
+    number = RUNS.index(look.colour)
+    return {"marker": look.mark, "markevery": (0.05 + 0.25 * number / min(runs, len(RUNS)), 0.25), "ms": 4}
 
 
 def _looks(runs: Iterable[Kind]) -> Iterator[tuple[Look, Kind]]:

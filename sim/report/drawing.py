@@ -5,7 +5,7 @@ lightness that colour-blind readers can tell apart, too.  Shapes of groups of gr
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from echelon.files import replacing
@@ -179,6 +180,12 @@ def _tidied(svg: str) -> str:
     svg = re.sub(r"font: ([\d.]+px) [^;\"]*", rf"font: \1 {FONT}", svg)
     svg = re.sub(r"font: (\w+ [\d.]+px) [^;\"]*", rf"font: \1 {FONT}", svg)
     return re.sub(r"\n\s*", "\n", svg)
+
+
+def explained(figure: Figure, words: Mapping[str, Mapping[str, Any]]) -> None:
+    """Explains lines and marks below a figure: by word the properties of each."""
+    lines = [Line2D([], [], **look) for look in words.values()]
+    figure.legend(lines, list(words), loc="outside lower center", ncols=len(words), handlelength=3)
 
 
 def hover(artist: Artist, text: str) -> None:

@@ -21,7 +21,7 @@ from echelon.sim.report.axes import (
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import INK, Look, Picture
+from echelon.sim.report.drawing import INK, QUIET, Look, Picture, explained
 from echelon.sim.report.thinning import thin
 from echelon.sim.report.time_axis import TimeAxis, above
 from echelon.sim.report.trajectory_map import trajectories
@@ -78,10 +78,21 @@ def transformed_state(blocks: Blocks, plan: Plan, width: float) -> Picture:
                 time.with_log(log).apply(axes, layer == layers[-1][0])
             row[0].set_title(title)
             row[0].set_ylabel("[m]")
-            if len(members) > 1:
-                marks = [Line2D([], [], color=look.colour, marker=look.mark, ms=3.6, mew=0) for look in looks.values()]
-                columns = min(len(members), 8)
-                row[1].legend(marks, looks, loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, borderpad=0)
+            several = len(members) > 1
+            marks = [
+                Line2D([], [], color=look.colour, marker=look.mark if several else "", ms=3.6, mew=0)
+                for look in looks.values()
+            ]
+            columns = min(len(members), 8)
+            row[1].legend(marks, looks, loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, borderpad=0)
+        explained(
+            figure,
+            {
+                "x": {"color": QUIET, "lw": 1.0},
+                "y": {"color": QUIET, "lw": 1.0, "ls": (0, (3, 1.2))},
+                "desired": {"color": "#b9b9c2", "lw": 2.4},
+            },
+        )
 
     return Picture(width, 1.75 * len(layers) + 0.5, draw)
 
@@ -113,7 +124,9 @@ def errors(blocks: Blocks, plan: Plan, width: float) -> Picture:
         error_limits(axes, [blocks])
         time.apply(axes)
         axes.set_ylabel("|e| [m]")
-        figure.legend(loc="outside lower center", ncols=min(len(blocks.series), 8), handlelength=3)
+        for text, face in (("settled to 5 %", QUIET), ("to 2 %", "white")):
+            axes.plot([], [], "o", ms=5, mfc=face, mec=QUIET, mew=1.2, label=text)
+        figure.legend(loc="outside lower center", ncols=min(len(blocks.series) + 2, int(width)), handlelength=3)
 
     return Picture(width, 3.5, draw)
 
@@ -163,6 +176,13 @@ def wheel_torques(trace: Trace, width: float) -> Picture:
             time.apply(axes, robot >= chosen[-min(columns, len(chosen))])
         for row in grid:
             row[0].set_ylabel("torque [N m]")
+        explained(
+            figure,
+            {
+                "right wheel, in the group's colour": {"color": Look.of_robot(plan, plan.robots[chosen[0]]).colour},
+                "left wheel": {"color": "#a5a5ae"},
+            },
+        )
 
     return Picture(width, 1.35 * -(-len(chosen) // columns) + 0.5, draw)
 

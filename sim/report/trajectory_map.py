@@ -12,7 +12,7 @@ from matplotlib.patches import Polygon
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan.plan import Plan
 from echelon.sim.report.axes import Array, as_map, extent, map_height
-from echelon.sim.report.drawing import CENTROID, Look, Picture
+from echelon.sim.report.drawing import CENTROID, QUIET, Look, Picture, explained
 from echelon.sim.report.thinning import ThinPath, drawable
 from echelon.sim.results.desired import Desired
 from echelon.sim.results.trace import Trace
@@ -82,6 +82,15 @@ def trajectories(trace: Trace, width: float) -> Picture:
                     fill = {"fc": look.colour, "ec": look.colour, "ls": look.dashes}
                     axes.add_patch(Polygon(_hull(corners), closed=True, alpha=0.13, lw=0.8, **fill))
                     _label(axes, corners.mean(axis=0), name, look.colour, (0, -3), ha="center", weight="bold")
+            explained(
+                figure,
+                {
+                    "desired centroid": {"color": "#8d8d97", "lw": 1.6, "dashes": (4, 2.5)},
+                    "centroid": {"color": CENTROID, "lw": 0.9},
+                    "start": {"color": QUIET, "ls": "", "marker": "^", "mfc": "white", "mec": QUIET},
+                    "end": {"color": QUIET, "ls": "", "marker": "^"},
+                },
+            )
         as_map(axes)
 
     return Picture(width, map_height(paths.corners, width), draw)

@@ -45,7 +45,9 @@ class Paths:
                 low = np.fmin(low, np.fmin.reduce(place, axis=(0, 1)))
                 high = np.fmax(high, np.fmax.reduce(place, axis=(0, 1)))
             start, end = states[0].copy() if part.start == 0 else start, states[-1].copy()
-        corners = np.stack([low, high])[:, None] if len(start) else np.empty((0, 1, 2))
+        if not len(start):
+            return cls((), np.empty((0, 2)), np.empty((0, 1, 2)), start, end)
+        corners = np.stack([low, high])[:, None]
         pixel, lowest = extent(corners) / (DPI * width), np.where(np.isfinite(low), low, 0.0)
         thinned = [ThinPath(lowest, pixel) for _ in range(len(start) + 1)]
         for _, states in trace.windows((X, Y)):

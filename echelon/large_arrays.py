@@ -17,7 +17,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-LARGE: Final = 32 << 20
+LARGE: Final = 4 << 20
 """Arrays and tables of more bytes are in a file"""
 BLOCK: Final = 16 << 10
 """Rows are written to a file when a source has this many bytes of them"""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from echelon.messages import Channel
 from echelon.plan.plan import NodePlan, Plan
 from echelon.runtime.turns import Turn
+from echelon.sim.replay.value_names import SQUARE
 from echelon.sim.results.recorded import Series
 from echelon.sim.results.trace import Array
 
@@ -63,7 +64,8 @@ class ChannelComparison:
     only_second: int
     first_difference: Difference | None
     largest: Difference | None
-    """The largest difference of a value, also if it is within the tolerance; None if all values are the same"""
+    """The largest difference of a value, also if it is within the tolerance; of a square of a torque only if all other values
+    are the same; None if all values are the same"""
     unshared: tuple[str, ...]
     """Values that only one series has; they are not compared"""
 
@@ -120,7 +122,10 @@ def compare(
     if complete and len(alone[1]):
         found.append(_lone(other, int(alone[1][0]), member, "first"))
     largest = None
-    if distances.size and distances.max() > 0:
+    squares = [name.endswith(SQUARE) for name in shared]
+    if distances[:, np.logical_not(squares)].any():  # squares of large torques would hide all other values
+        distances[:, squares] = 0.0
+    if distances.any():
         largest = at(*divmod(int(np.argmax(distances)), distances.shape[1]))
     return ChannelComparison(
         member,

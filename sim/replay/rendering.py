@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from echelon.messages import Channel
 from echelon.sim.replay.comparison import ChannelComparison, Difference
+from echelon.sim.replay.value_names import unit_of
 
 Words = tuple[str, str]
 """What the first and the second series are called"""
@@ -69,7 +70,18 @@ def _first(channel: ChannelComparison, words: Words) -> str:
     where = f"t = {first.time:.9g} s, #{first.sequence}"
     if first.lacking:
         return f"{where}: {words[1] if first.lacking == 'first' else words[0]} only"
-    return f"{where}, {first.value}: {first.first:.6g}, {first.second:.6g}"
+    return f"{where}, {first.value}: {', '.join(_apart(first))}"
+
+
+def _apart(difference: Difference) -> tuple[str, str]:
+    """Returns both values with as many digits as it takes to tell them apart, six at least."""
+    assert difference.first is not None
+    assert difference.second is not None
+    for digits in range(6, 18):
+        texts = f"{difference.first:.{digits}g}", f"{difference.second:.{digits}g}"
+        if texts[0] != texts[1]:
+            break
+    return texts
 
 
 def _largest(channel: ChannelComparison) -> str:
@@ -77,7 +89,8 @@ def _largest(channel: ChannelComparison) -> str:
     if largest is None:
         return NOTHING
     size = _distance(largest)
-    return f"{'not finite' if size is None else f'{size:.3g}'} {largest.value}, t = {largest.time:.9g} s"
+    words = "not finite" if size is None else f"{size:.3g} {unit_of(largest.value)}".rstrip()
+    return f"{words}, {largest.value}, t = {largest.time:.9g} s"
 
 
 def _distance(difference: Difference) -> float | None:

@@ -4,11 +4,29 @@ The order is that of the layouts (`echelon.messages`, `echelon.plan.layout`).
 """
 
 from collections.abc import Iterable
+from typing import Final
 
 from echelon.messages import GROUP_FIELDS, STATE_FIELDS, TORQUE_FIELDS, Channel
 from echelon.plan.layout import message_sizes_of
 from echelon.plan.plan import BlockPlan, NodePlan, Plan
 from echelon.sim.results.block_series import component_names
+
+SQUARE: Final = "_square"
+"""The end of the names of mean squares of torques"""
+_UNITS: Final = {
+    "x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "v": "m/s", "theta": "rad", "omega": "rad/s",
+    "ax": "m/s²", "ay": "m/s²", "fx": "m/s²", "fy": "m/s²", "error": "m/s",
+    "tau_right": "N m", "tau_left": "N m", "tau_right_peak": "N m", "tau_left_peak": "N m",
+    "tau_right_square": "N² m²", "tau_left_square": "N² m²",
+    "speed_right": "rad/s", "speed_left": "rad/s",
+    "saturated": "", "commanded": "",
+}  # fmt: skip
+"""By the first word of a name; that of `error rate …` is `error`"""
+
+
+def unit_of(name: str) -> str:
+    """Returns the unit of the value with a name that `value_names` gives; empty for a number without one or another name."""
+    return _UNITS.get(name.split(" ", 1)[0], "")
 
 
 def value_names(plan: Plan, source: int, channel: Channel) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Axes that the figures of one run and of several runs share: small axes in rows, time, torque, distance, errors, maps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -9,11 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan.plan import Plan
-from echelon.sim.report.drawing import QUIET, drawable, short
+from echelon.sim.report.drawing import QUIET, short
+from echelon.sim.report.thinning import Change, drawable, pieces, span
 from echelon.sim.report.time_axis import TimeAxis
 from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances
@@ -45,34 +46,42 @@ def small_multiples(figure: Figure, count: int, columns: int, sharey: bool = Tru
 def distance_time(near: Distances, plan: Plan) -> TimeAxis:
     """Returns the time axis for distances.  It ends soon after the smallest distance stays within 2 % of its last value, but
     not before the closest encounter."""
-    smallest, time = drawable(near.smallest), TimeAxis.of(plan, near.times_ns)
-    if not len(smallest) or not np.isfinite(smallest).all():
+    smallest, time = near.smallest, TimeAxis.of(plan, near.times_ns)
+    if not all(np.isfinite(drawable(smallest[part])).all() for part in pieces(len(smallest))) or not len(smallest):
         return time
     closest_s = 0.0 if near.closest is None else near.closest.time_ns / 1e9
-    moves_s = _last_s(near.times_ns, np.abs(smallest - smallest[-1]) > CALM * abs(smallest[-1]))
+    moves_s = _last_s(near.times_ns, lambda part: np.abs(smallest[part] - smallest[-1]) > CALM * abs(smallest[-1]))
     return time.until(max(moves_s, closest_s))
 
 
 def torque_time(trace: Trace) -> TimeAxis:
     """Returns the time axis for torques.  It ends soon after the last torque above 2 % of the largest."""
     bound, time = CALM * TorqueScale.of([trace]).limit, TimeAxis.of(trace.plan, max(trace.times_ns, key=len))
+
+    def last_s(times_ns: NDArray[np.int64], states: Array) -> float:
+        return _last_s(times_ns, lambda part: np.any(~(np.abs(states[part][:, TAUS]) <= bound), axis=1))
+
     with np.errstate(invalid="ignore"):
-        active = [np.any(~(np.abs(states[:, TAUS]) <= bound), axis=1) for states in trace.states]
-    return time.until(
-        max((_last_s(times_ns, row) for times_ns, row in zip(trace.times_ns, active, strict=True)), default=0.0)
-    )
+        return time.until(max(map(last_s, trace.times_ns, trace.states), default=0.0))
 
 
-def _last_s(times_ns: NDArray[np.int64], active: ArrayLike) -> float:
-    """Returns the last of the instants at which `active` (T,) is true [s]; 0 if there is none."""
-    found = np.flatnonzero(active)
-    return float(times_ns[found[-1]]) / 1e9 if found.size else 0.0
+def _last_s(times_ns: NDArray[np.int64], active: Callable[[slice], NDArray[np.bool_]]) -> float:
+    """Returns the last of the instants (T,) at which `active` is true [s], which tells it of a part; 0 if there is none."""
+    for part in reversed(list(pieces(len(times_ns)))):
+        found = np.flatnonzero(active(part))
+        if found.size:
+            return float(times_ns[part.start + found[-1]]) / 1e9
+    return 0.0
 
 
 def largest_torques(trace: Trace) -> list[float]:
     """Returns the largest torque of each robot within its periods [N m]; 0 if none is finite."""
     with np.errstate(all="ignore"):
-        return [float(np.fmax.reduce(states[:, PEAKS], axis=None, initial=0.0)) for states in trace.states]
+        return [max((0.0, *(_largest(states[part]) for part in pieces(len(states))))) for states in trace.states]
+
+
+def _largest(states: Array) -> float:
+    return float(np.fmax.reduce(states[:, PEAKS], axis=None, initial=0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +98,13 @@ class TorqueScale:
         """Returns the axis for some runs: logarithmic if their peaks are much larger than most of their torques (`PEAKED`)."""
         largest = [torque for trace in traces for torque in largest_torques(trace) if np.isfinite(torque)]
         limit = min(max([*largest, 1e-3]), 1e12)
-        taus = np.abs(np.concatenate([states[:, TAUS].ravel() for trace in traces for states in trace.states]))
-        taus = taus[np.isfinite(taus) & (taus > 0)]
-        if limit < PEAKED * (float(np.quantile(taus, 0.95)) if taus.size else limit):
+        count = large = 0
+        for states in (states for trace in traces for states in trace.states):
+            for part in pieces(len(states)):
+                taus = np.abs(states[part][:, TAUS])
+                count += int(np.count_nonzero(np.isfinite(taus) & (taus > 0)))
+                large += int(np.count_nonzero(np.isfinite(taus) & (taus > limit / PEAKED)))
+        if large > 0.05 * count or not count:
             return cls(limit, None)
         return cls(limit, 10.0 ** (np.floor(np.log10(limit)) - 3))
 
@@ -136,18 +149,25 @@ def plain_numbers(axis: Axis) -> None:
         set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def distance_limits(axes: Axes, shown: Array, radius: float, sensing: float) -> None:
-    """Sets the limits and the label of an axis of distances so that both radii and all distances `shown` [m] are in it."""
-    finite = shown[np.isfinite(shown)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (radius, sensing)
+def shown_distance(radius: float) -> Change:
+    """Returns what makes of distances [m] those that are drawn: on the logarithmic axis none is less than a thousandth of the
+    avoidance radius."""
+    return lambda values: np.maximum(drawable(values), radius * 1e-3)
+
+
+def distance_limits(axes: Axes, several: Sequence[Array], radius: float, sensing: float) -> None:
+    """Sets the limits and the label of an axis of distances so that both radii and all distances [m], (T,) each, are in it."""
+    spans = [shown_distance(radius)(np.array(span(values))) for values in several]
+    low, high = np.fmin.reduce(spans, axis=None), np.fmax.reduce(spans, axis=None)
+    low, high = (float(low), float(high)) if np.isfinite(low) else (radius, sensing)
     axes.set_ylim(min(low, radius) / 1.6, max(high, sensing) * 1.6)
     plain_numbers(axes.yaxis)
     axes.set_ylabel("smallest distance [m]")
 
 
 def positive(norm: Array) -> Array:
-    """Returns |e| for a logarithmic axis: NaN where it is zero."""
-    return np.where(norm > 0, norm, np.nan)
+    """Returns |e| as it is drawn on a logarithmic axis: NaN where it is zero."""
+    return drawable(np.where(norm > 0, norm, np.nan))
 
 
 def as_map(axes: Axes) -> None:
@@ -176,7 +196,7 @@ def map_height(place: Array, width: float) -> float:
 def error_limits(axes: Axes, several: Sequence[Blocks]) -> None:
     """Limits an axis of errors to six decades below the largest: near its zero crossings |e| is arbitrarily small, and that
     says nothing."""
-    norms = [drawable(series.norm) for blocks in several for series in blocks.series]
-    largest = max((float(np.fmax.reduce(norm, initial=0.0)) for norm in norms), default=0.0)
+    highs = [span(series.norm)[1] for blocks in several for series in blocks.series]
+    largest = float(np.fmax.reduce([0.0, *highs]))
     if largest > 0:
         axes.set_ylim(largest * 1e-6, largest * 2)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -23,12 +23,14 @@ from echelon.sim.report.axes import (
     map_height,
     positive,
     radii,
+    shown_distance,
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import Look, Picture, drawable
+from echelon.sim.report.drawing import RUNS, Array, Look, Picture
+from echelon.sim.report.thinning import drawable
 from echelon.sim.report.time_axis import TimeAxis
-from echelon.sim.report.trajectory_map import X, Y
+from echelon.sim.report.trajectory_map import Paths
 from echelon.sim.results.block_series import Blocks
 from echelon.sim.results.distances import Distances
 from echelon.sim.results.trace import Trace
@@ -77,16 +79,16 @@ def longest(times: Sequence[TimeAxis]) -> TimeAxis:
 
 
 def _paths(runs: Sequence[Compared]) -> Picture:
-    places = [drawable(run.trace.common((X, Y))[1]) for run in runs]
-    shown = np.concatenate([place.reshape(-1, 1, 2) for place in places])
+    several = [Paths.of(run.trace, WIDTH) for run in runs]
+    shown = np.concatenate([paths.corners for paths in several])
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        for look, place in _looks(places):
-            for path in place.transpose(1, 0, 2) if len(place) else ():
+        for look, paths in _looks(several):
+            for path, *ends in zip(paths.robots, paths.start, paths.end, strict=True):
                 axes.plot(*path.T, color=look.colour, ls=look.dashes, lw=0.9, alpha=0.85)
-                for at, face in ((0, "white"), (-1, look.colour)):
-                    axes.plot(*path[at], look.mark, ms=4, mfc=face, mec=look.colour, mew=0.9, zorder=5)
+                for end, face in zip(ends, ("white", look.colour), strict=True):
+                    axes.plot(*drawable(end[:2]), look.mark, ms=4, mfc=face, mec=look.colour, mew=0.9, zorder=5)
         if extent(shown) > 0:
             as_map(axes)
         _legend(figure, runs)
@@ -105,8 +107,8 @@ def _errors(runs: Sequence[Compared], time: TimeAxis) -> Picture:
             axes.set_yscale("log")
             for look, (run, by_name) in _looks(zip(runs, series, strict=True)):
                 if name in by_name:
-                    line = time.thin(run.blocks.times_ns, positive(by_name[name].norm))
-                    axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2)
+                    line = time.thin(run.blocks.times_ns, by_name[name].norm, positive)
+                    axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2, **_marks(line, look, len(runs)))
             axes.set_title(name)
             error_limits(axes, [run.blocks for run in runs])
             time.apply(axes, number >= len(names) - columns)
@@ -120,14 +122,14 @@ def _errors(runs: Sequence[Compared], time: TimeAxis) -> Picture:
 def _distance(runs: Sequence[Compared], time: TimeAxis) -> Picture:
     avoidance = runs[0].trace.plan.avoidance
     radius, sensing = avoidance.avoidance_radius, avoidance.sensing_radius
-    shown = [np.maximum(drawable(run.near.smallest), radius * 1e-3) for run in runs]
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         radii(axes, radius, sensing)
-        for look, (run, smallest) in _looks(zip(runs, shown, strict=True)):
-            axes.plot(*time.thin(run.near.times_ns, smallest), color=look.colour, ls=look.dashes, lw=1.2)
-        distance_limits(axes, np.concatenate(shown), radius, sensing)
+        for look, run in _looks(runs):
+            line = time.thin(run.near.times_ns, run.near.smallest, shown_distance(radius))
+            axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.2, **_marks(line, look, len(runs)))
+        distance_limits(axes, [run.near.smallest for run in runs], radius, sensing)
         time.apply(axes)
         _legend(figure, runs)
 
@@ -152,7 +154,8 @@ def _torques(runs: Sequence[Compared], time: TimeAxis, scale: TorqueScale) -> Pi
             for look, (run, by_name) in _looks(zip(runs, robots, strict=True)):
                 if name in by_name:
                     times_ns, states = run.trace.times_ns[by_name[name]], run.trace.states[by_name[name]]
-                    axes.plot(*time.thin(times_ns, states[:, TAUS[0]]), color=look.colour, ls=look.dashes, lw=1.0)
+                    line = time.thin(times_ns, states[:, TAUS[0]])
+                    axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.0, **_marks(line, look, len(runs)))
             axes.set_title(name)
             time.apply(axes, number >= len(names) - columns)
         for row in grid:
@@ -160,6 +163,14 @@ def _torques(runs: Sequence[Compared], time: TimeAxis, scale: TorqueScale) -> Pi
         _legend(figure, runs)
 
     return Picture(WIDTH, 1.35 * -(-len(names) // columns) + 0.8, draw)
+
+
+def _marks(line: tuple[Array, Array], look: Look, runs: int) -> dict[str, Any]:
+    """Returns what gives the line of a run its marks, apart from those of the other runs; nothing for an empty line."""
+    if not np.isfinite(line[1]).any():  # matplotlib marks no empty line
+        return {}
+    number = RUNS.index(look.colour)
+    return {"marker": look.mark, "markevery": (0.05 + 0.25 * number / min(runs, len(RUNS)), 0.25), "ms": 4}
 
 
 def _looks(runs: Iterable[Kind]) -> Iterator[tuple[Look, Kind]]:

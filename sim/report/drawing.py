@@ -1,11 +1,11 @@
-"""What all figures share: colours, dashes and marks, the style, thinned lines, and how figures become files.
+"""What all figures share: colours, dashes and marks, the style, and how figures become files.
 
 Each group has its own colour, dashes and mark.  The first three colours are red, green and blue as in the paper, in tones and
 lightness that colour-blind readers can tell apart, too.  Shapes of groups of groups are purple, the centroid is black.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from echelon.files import replacing
@@ -37,10 +38,6 @@ CENTROID: Final = "#1d1d22"
 INK: Final = "#26262b"
 QUIET: Final = "#70707a"
 FONT: Final = "'Inter', 'Source Sans 3', 'Helvetica Neue', Arial, 'Liberation Sans', sans-serif"
-COLUMNS: Final = 500
-"""Columns of a picture; lines are thinned to the smallest and the largest value in each column."""
-DRAWABLE: Final = 1e9
-"""Larger values are not drawn: otherwise they would hide everything else in the figures of a diverged run."""
 
 _HOVER: Final = "hover: "
 """Ids of SVG elements that begin so become what browsers show beside the pointer"""
@@ -185,34 +182,15 @@ def _tidied(svg: str) -> str:
     return re.sub(r"\n\s*", "\n", svg)
 
 
+def explained(figure: Figure, words: Mapping[str, Mapping[str, Any]]) -> None:
+    """Explains lines and marks below a figure: by word the properties of each."""
+    lines = [Line2D([], [], **look) for look in words.values()]
+    figure.legend(lines, list(words), loc="outside lower center", ncols=len(words), handlelength=3)
+
+
 def hover(artist: Artist, text: str) -> None:
     """Gives a part of a figure a text that browsers show while the pointer is on it (SVG alone)."""
     artist.set_gid(_HOVER + text)
-
-
-def thin(times_ns: NDArray[np.int64], values: Array, log: bool) -> tuple[Array, Array]:
-    """Returns instants [s] and values of a line, thinned for drawing: the first, smallest and largest value in each of
-    `COLUMNS` columns of the picture, in order of time.
-
-    `times_ns` and `values` are (T,).  With a logarithmic axis (`log`) instants up to 0 are left out."""
-    keep = times_ns > 0 if log else np.ones(len(times_ns), dtype=bool)
-    times, values = times_ns[keep] / 1e9, drawable(values[keep])
-    if len(times) <= 4 * COLUMNS:
-        return times, values
-    axis = np.log(times) if log else times
-    column = np.minimum(((axis - axis[0]) / (axis[-1] - axis[0]) * COLUMNS).astype(int), COLUMNS - 1)
-    starts = np.flatnonzero(np.diff(column, prepend=-1))
-    # NaN sorts last, so it counts as the largest value of its column, and the line has a gap there.
-    order = np.lexsort((values, column))
-    ends = np.append(starts[1:], len(times)) - 1
-    picked = np.unique(np.concatenate([starts, order[starts], order[ends], [len(times) - 1]]))
-    return times[picked], values[picked]
-
-
-def drawable(values: Array) -> Array:
-    """Returns values with NaN in place of those that are not finite or not below `DRAWABLE` in magnitude."""
-    with np.errstate(invalid="ignore"):
-        return np.where(np.abs(values) < DRAWABLE, values, np.nan)
 
 
 def short(value: float) -> str:

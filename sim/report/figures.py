@@ -17,10 +17,12 @@ from echelon.sim.report.axes import (
     largest_torques,
     positive,
     radii,
+    shown_distance,
     small_multiples,
     torque_time,
 )
-from echelon.sim.report.drawing import INK, Look, Picture, drawable, thin
+from echelon.sim.report.drawing import INK, QUIET, Look, Picture, explained
+from echelon.sim.report.thinning import thin
 from echelon.sim.report.time_axis import TimeAxis, above
 from echelon.sim.report.trajectory_map import trajectories
 from echelon.sim.results.block_series import Blocks, BlockSeries
@@ -76,10 +78,21 @@ def transformed_state(blocks: Blocks, plan: Plan, width: float) -> Picture:
                 time.with_log(log).apply(axes, layer == layers[-1][0])
             row[0].set_title(title)
             row[0].set_ylabel("[m]")
-            if len(members) > 1:
-                marks = [Line2D([], [], color=look.colour, marker=look.mark, ms=3.6, mew=0) for look in looks.values()]
-                columns = min(len(members), 8)
-                row[1].legend(marks, looks, loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, borderpad=0)
+            several = len(members) > 1
+            marks = [
+                Line2D([], [], color=look.colour, marker=look.mark if several else "", ms=3.6, mew=0)
+                for look in looks.values()
+            ]
+            columns = min(len(members), 8)
+            row[1].legend(marks, looks, loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, borderpad=0)
+        explained(
+            figure,
+            {
+                "x": {"color": QUIET, "lw": 1.0},
+                "y": {"color": QUIET, "lw": 1.0, "ls": (0, (3, 1.2))},
+                "desired": {"color": "#b9b9c2", "lw": 2.4},
+            },
+        )
 
     return Picture(width, 1.75 * len(layers) + 0.5, draw)
 
@@ -95,7 +108,7 @@ def errors(blocks: Blocks, plan: Plan, width: float) -> Picture:
             if not series.block.size:
                 continue
             look = Look.of_block(plan, series.block)
-            line = time.thin(blocks.times_ns, positive(series.norm))
+            line = time.thin(blocks.times_ns, series.norm, positive)
             axes.plot(*line, color=look.colour, ls=look.dashes, lw=1.3, zorder=3)
             for fraction, face in ((0.05, look.colour), (0.02, "white")):
                 settled = settle(plan, series, blocks.times_ns, fraction).settled_ns
@@ -111,7 +124,9 @@ def errors(blocks: Blocks, plan: Plan, width: float) -> Picture:
         error_limits(axes, [blocks])
         time.apply(axes)
         axes.set_ylabel("|e| [m]")
-        figure.legend(loc="outside lower center", ncols=min(len(blocks.series), 8), handlelength=3)
+        for text, face in (("settled to 5 %", QUIET), ("to 2 %", "white")):
+            axes.plot([], [], "o", ms=5, mfc=face, mec=QUIET, mew=1.2, label=text)
+        figure.legend(loc="outside lower center", ncols=min(len(blocks.series) + 2, int(width)), handlelength=3)
 
     return Picture(width, 3.5, draw)
 
@@ -120,16 +135,15 @@ def smallest_distance(near: Distances, plan: Plan, width: float) -> Picture:
     """Draws the smallest distance of all pairs over time, with avoidance radius, sensing radius and the closest encounter."""
     time = distance_time(near, plan)
     radius, sensing = plan.avoidance.avoidance_radius, plan.avoidance.sensing_radius
-    shown = np.maximum(drawable(near.smallest), radius * 1e-3)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         radii(axes, radius, sensing)
-        axes.plot(*time.thin(near.times_ns, shown), color=INK, lw=1.0, zorder=3)
+        axes.plot(*time.thin(near.times_ns, near.smallest, shown_distance(radius)), color=INK, lw=1.0, zorder=3)
         if near.closest is not None and time.shows(near.closest.time_ns / 1e9):
             at = near.closest.time_ns / 1e9, max(near.closest.distance, radius * 1e-3)
             axes.plot(*at, "o", ms=5, mfc="white", mec=INK, zorder=5, clip_on=False)
-        distance_limits(axes, shown, radius, sensing)
+        distance_limits(axes, [near.smallest], radius, sensing)
         time.apply(axes)
 
     return Picture(width, 2.7, draw)
@@ -162,6 +176,13 @@ def wheel_torques(trace: Trace, width: float) -> Picture:
             time.apply(axes, robot >= chosen[-min(columns, len(chosen))])
         for row in grid:
             row[0].set_ylabel("torque [N m]")
+        explained(
+            figure,
+            {
+                "right wheel, in the group's colour": {"color": Look.of_robot(plan, plan.robots[chosen[0]]).colour},
+                "left wheel": {"color": "#a5a5ae"},
+            },
+        )
 
     return Picture(width, 1.35 * -(-len(chosen) // columns) + 0.5, draw)
 

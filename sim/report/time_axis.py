@@ -10,7 +10,8 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from echelon.plan.plan import Plan
-from echelon.sim.report.drawing import QUIET, Array, thin
+from echelon.sim.report.drawing import QUIET, Array
+from echelon.sim.report.thinning import Change, drawable, thin
 from echelon.sim.results.settling import response_ns
 
 APART: Final = 8.0
@@ -33,7 +34,7 @@ class TimeAxis:
     def of(cls, plan: Plan, times_ns: NDArray[np.int64]) -> Self:
         """Returns the axis for a run: logarithmic if the slowest block takes `APART` times as long to respond as the fastest,
         or longer, and the run is long enough to show it."""
-        after = times_ns[times_ns > 0]
+        after = times_ns[int(np.searchsorted(times_ns, 0, side="right")) :]
         first, last = (float(after[0]) / 1e9, float(after[-1]) / 1e9) if len(after) > 1 else (1e-3, 1.0)
         responses = [response_ns(block) / 1e9 for block in plan.blocks if block.size]
         fastest = min(responses, default=last)
@@ -54,11 +55,11 @@ class TimeAxis:
         """Returns whether an instant [s] is on the axis."""
         return (self.first if self.log else 0.0) <= t <= self.last
 
-    def thin(self, times_ns: NDArray[np.int64], values: Array) -> tuple[Array, Array]:
-        """Returns the part of a line that the axis shows, thinned."""
+    def thin(self, times_ns: NDArray[np.int64], values: Array, change: Change = drawable) -> tuple[Array, Array]:
+        """Returns the part of a line that the axis shows, thinned; `change` makes of values what is drawn."""
         if self.last < self.end:
             times_ns = times_ns[: int(np.searchsorted(times_ns, round(self.last * 1e9), side="right"))]
-        return thin(times_ns, values[: len(times_ns)], self.log)
+        return thin(times_ns, values[: len(times_ns)], self.log, change)
 
     def apply(self, axes: Axes, labelled: bool = True) -> None:
         """Sets the x axis of axes; a label is written if `labelled`: on the lowest of several axes above each other."""

@@ -161,7 +161,7 @@ def _kept(name: str, evidence: Evidence) -> Iterator[CheckResult]:
         one, other = (plan.robots[robot].name for robot in worst.pair)
         text = (
             f"{len(near.violations)} violation(s) of {radius:g} m; {one} and {other} came to {worst.smallest:.4g} m "
-            f"after {worst.first_ns / 1e9:.6g} s"
+            f"in the one that began at {worst.first_ns / 1e9:.6g} s"
         )
         yield CheckResult(name, "failed", text, worst.smallest, "m", radius, (one, other))
     else:

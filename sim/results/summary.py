@@ -101,7 +101,12 @@ def _lines(summary: Summary) -> Iterator[str]:
     if torques := [(row.peak, row.robot) for row in summary.torque if row.peak is not None]:
         peak, robot = max(torques)
         share = max(row.saturation_share or 0.0 for row in summary.torque)
-        yield f"  torque   peak {number(peak, 'N m')} ({robot}), saturated at most {100 * share:.3g} % of the time"
+        of_time = f"saturated at most {100 * share:.3g} % of the time"
+        yield (
+            f"  torque   peak {number(peak, 'N m')} ({robot}), {of_time}"
+            if peak > 0
+            else "  torque   none: all are zero"
+        )
     if summary.links:
         sent, lost = sum(link.sent for link in summary.links), sum(link.lost for link in summary.links)
         twice = sum(link.duplicates for link in summary.links)

@@ -52,6 +52,10 @@ class Span:
         return float(self.low) + share * (float(self.high) - float(self.low))
 
 
+_PARTS: Final = re.compile(r"""((?:"(?:[^"\\]|\\.)*"|'[^']*'|[^,])*),""")
+"""What is between commas; a comma in quotes does not count"""
+
+
 @dataclass(frozen=True, slots=True)
 class Vary:
     """A key of the scenario with the values that it takes: a list, or a range without a step."""
@@ -120,8 +124,8 @@ def _listed(text: str) -> tuple[Any, ...]:
     try:
         table = tomllib.loads(f"values = [{text}]")
     except (ValueError, RecursionError):
-        return tuple(value_of(part) for part in text.split(","))
-    return tuple(table["values"]) if len(table) == 1 else tuple(text.split(","))
+        return tuple(value_of(part) for part in _PARTS.findall(f"{text},"))
+    return tuple(table["values"]) if len(table) == 1 else tuple(_PARTS.findall(f"{text},"))
 
 
 def _unique(values: tuple[Any, ...], where: str) -> tuple[Any, ...]:

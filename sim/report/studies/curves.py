@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from echelon.sim.report.axes import plain_numbers, small_multiples
-from echelon.sim.report.drawing import QUIET, Array, Look, Picture, drawable
+from echelon.sim.report.drawing import QUIET, Array, Look, Picture
 from echelon.sim.report.studies.results import Series, StudyResults, pairs
 from echelon.sim.report.studies.stability import touched
+from echelon.sim.report.thinning import drawable
 
 MOST_PANELS: Final = 6
 """Values of other keys for which a figure has axes of their own"""

@@ -41,6 +41,16 @@ def test_what_differs_by_the_tolerance_is_equal_and_still_told() -> None:
     assert not compared(first, second, 0.2499).is_equal
 
 
+def test_the_largest_difference_is_of_a_square_of_a_torque_only_if_all_else_is_the_same() -> None:
+    names = ("x", "tau_right_square")
+    first = series((0, 1.0, 2.0), (1, 1.0, 2.0))
+    both = compare(PLAN, (first, names), (series((0, 1.0, 900.0), (1, 1.5, 2.0)), names), tolerance=0.0)
+    assert both.largest == Difference(10, 1, "g1/r1", Channel.STATE, "x", 1.0, 1.5)
+    assert both.first_difference == Difference(0, 0, "g1/r1", Channel.STATE, "tau_right_square", 2.0, 900.0)
+    alone = compare(PLAN, (first, names), (series((0, 1.0, 900.0), (1, 1.0, 2.0)), names), tolerance=0.0)
+    assert alone.largest == both.first_difference
+
+
 @pytest.mark.parametrize(
     ("one", "other", "equal"),
     [(nan, nan, True), (inf, inf, True), (0.0, -0.0, True), (nan, 1.0, False), (inf, -inf, False), (1.0, inf, False)],

@@ -83,6 +83,12 @@ def test_one_changed_value_is_named(tmp_path: Path) -> None:
     )
     assert [channel.member for channel in found.channels if not channel.is_equal] == ["g2/r4"]
     assert str(found).splitlines()[-1].startswith("the runs part at t = 0.11 s: g2/r4, state number 11, theta: A ")
+    first, second = found.first_difference.first, found.first_difference.second
+    assert f"{first:.6g}" == f"{second:.6g}"
+    (line,) = (line for line in str(found).splitlines() if "g2/r4" in line and "#11" in line)
+    texts = line.split("theta: ", 1)[1].split("  ")[0].split(", ")
+    assert texts[0] != texts[1]  # as many digits as it takes
+    assert line.endswith(" 1e-09 rad, theta, t = 0.11 s")
     assert differing(run, changed, 2e-9).equal
 
 

@@ -5,7 +5,7 @@ import pytest
 from echelon.messages import Channel
 from echelon.plan.layout import NodeLayout, message_sizes
 from echelon.plan.plan import NodePlan, Plan
-from echelon.sim.replay.value_names import value_names
+from echelon.sim.replay.value_names import unit_of, value_names
 from support.runs import plan_of
 
 COUPLED = "law.coupling=[{block='inter',onto='g1',value=0.1}]"
@@ -29,6 +29,7 @@ def check_names(plan: Plan) -> None:
         if size is not None:
             names = value_names(plan, source, channel)
             assert len(names) == len(set(names)) == size
+            assert all(unit_of(name) or name in ("saturated", "commanded") for name in names)
 
 
 def test_a_name_stands_at_the_place_of_its_value() -> None:

@@ -110,6 +110,35 @@ def test_colour_is_not_the_only_cue(of) -> None:
         assert len({getattr(look, kind) for look in looks}) == len(looks)
 
 
+def test_figures_explain_their_lines_and_marks(lab: Trace) -> None:
+    words = {
+        "trajectories": {"desired centroid", "centroid", "start", "end"},
+        "blocks": {"g1", "g2", "g3", "inter", "centroid", "x", "y", "desired"},
+        "errors": {"g1", "g2", "g3", "inter", "centroid", "settled to 5 %", "to 2 %"},
+        "torques": {"right wheel, in the group's colour", "left wheel"},
+    }
+    blocks = block_series(lab)
+    for name, texts in words.items():
+        figure = Figure()
+        picture(name, lab, blocks, 11.5).draw(figure)
+        legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
+        assert {text.get_text() for legend in legends if legend is not None for text in legend.get_texts()} == texts, (
+            name
+        )
+
+
+def test_the_curves_of_a_comparison_have_the_marks_of_its_legend(lab: Trace) -> None:
+    runs = [Compared(name, lab, block_series(lab), distances(lab)) for name in "ab"]
+    for name, (drawing, _) in comparison(runs).items():
+        figure = Figure()
+        drawing.draw(figure)
+        (legend,) = figure.legends
+        marks = {line.get_marker() for line in legend.get_lines()}
+        assert len(marks) == 2
+        for axes in figure.axes:
+            assert not axes.lines or marks <= {line.get_marker() for line in axes.lines}, name
+
+
 @pytest.mark.parametrize("width", [11.5, 5.6])
 def test_words_of_claims_are_above_the_curves_and_apart(width: float) -> None:
     claims = ", ".join(f"{{block='{block}', settled_by={by}}}" for block, by in (

@@ -19,10 +19,10 @@ from echelon.bridge.reports import (
     WheelsReport,
 )
 from echelon.planning.loading import effective_toml
-from echelon.sim.report.drawing import COLUMNS, thin
 from echelon.sim.report.page import table
 from echelon.sim.report.report import write_report
 from echelon.sim.report.run_for_report import RunForReport
+from echelon.sim.report.thinning import COLUMNS, thin
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.tables import AGE_KEYS
 from echelon.sim.results.trace import Trace

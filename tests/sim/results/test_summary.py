@@ -265,6 +265,14 @@ def test_violations_fail_whether_robots_avoid_each_other_or_not(enabled):
     (check,) = (check for check in summary["verdict"]["checks"] if check["name"] in ("avoidance", "distance"))
     assert (check["name"], check["outcome"]) == ("avoidance" if enabled else "distance", "failed")
     assert "1 violation(s) of 0.5 m; g1/r2 and g1/r1 came to" in check["text"]
+    assert check["text"].endswith(" m in the one that began at 5 s")  # the closest instant is another one
+
+
+def test_a_peak_of_torque_has_a_robot_only_where_there_is_torque(run):
+    states = [part.copy() for part in run.trace.states]
+    assert "  torque   none: all are zero\n" in summary_text(record_of(run.trace))
+    states[4][3000, FIELD["tau_left_peak"]] = 9.0
+    assert "  torque   peak 9 N m (g2/r5), " in summary_text(record_of(with_states(run.trace, states)))
 
 
 def test_torques_are_measured_over_the_periods(run):

@@ -24,6 +24,8 @@ from echelon.sim.sweep.values import Vary, parse_vary, vary_of
         ("a=true,false", (True, False)),
         ("a=hold,predict", ("hold", "predict")),
         ("a='x:y',\"z\"", ("x:y", "z")),
+        ("a='my.py:A,B',z", ("my.py:A,B", "z")),
+        ('a="my.py:A,B",z,"', ("my.py:A,B", "z", '"')),
         ("a=[0.1,0.2],[0.2,0.4]", ([0.1, 0.2], [0.2, 0.4])),
         ("a={mean=0.1,burst=3},0.1", ({"mean": 0.1, "burst": 3}, 0.1)),
     ],

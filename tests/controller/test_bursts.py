@@ -41,6 +41,7 @@ def lossy(plan: Plan, at: list[int], loss: float, burst: float | None = None) ->
     return replace(plan, links=tuple(links))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timing", TIMINGS)
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_bursts_without_memory_are_independent_losses(channel: Channel, timing: str) -> None:

@@ -319,6 +319,7 @@ def test_margin_with_periods_of_different_length_is_where_points_begin_to_grow(c
         assert (radius < 1) == (ticks <= found.ticks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_every_delay_up_to_the_margin_is_stable_and_the_next_is_not(channel, seed):

@@ -126,6 +126,7 @@ def test_second_moment_where_each_robot_is_late_by_its_own_delay(timing, monkeyp
     check_patterns(plan, monkeypatch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timing", ["time_driven", "event_driven"])
 @pytest.mark.parametrize("ticks", [0.0, 0.5, 1.0, 1.5, 29.5])
 def test_without_loss_the_second_moment_grows_as_the_linear_run_does(ticks, timing):
@@ -134,6 +135,7 @@ def test_without_loss_the_second_moment_grows_as_the_linear_run_does(ticks, timi
     assert losses.radius(0.0) == pytest.approx(spectral_radius(LinearRun(plan).map()) ** 2, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "links",
     [

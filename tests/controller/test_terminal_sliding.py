@@ -181,6 +181,7 @@ def test_finite_against_exponential_in_numbers():
         assert path[round(100 * t)] < gone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gamma", "beta", "kappa"), PARAMETERS[::3])
 @pytest.mark.parametrize("w", [0.05, -0.3])
 def test_the_error_under_a_constant_acceleration_is_the_closed_form(gamma, beta, kappa, w):

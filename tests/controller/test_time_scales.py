@@ -52,6 +52,7 @@ def exact_roots(fixed: np.ndarray, scaled: np.ndarray) -> np.ndarray:
     return np.sort(real[real > 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("tree", TREES[:2])
 def test_largest_epsilon_and_coupling_are_the_roots_of_the_kronecker_sum(tree, seed):

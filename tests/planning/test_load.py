@@ -638,6 +638,7 @@ def test_any_override_is_applied_or_explained(name, overrides):
     check(TEXTS_OF[name], *overrides)
 
 
+@pytest.mark.slow
 @fuzz
 @given(st.text(max_size=200) | st.text(alphabet="[]{}=.,\"'\n#ab1 -_:T", max_size=80))
 def test_any_text_is_a_scenario_or_explained(text):

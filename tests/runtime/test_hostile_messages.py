@@ -191,6 +191,7 @@ def test_nothing_that_comes_raises_or_fills_memory(overrides: tuple[str, ...], i
     assert max(waiting) < 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [13, 14], ids=["bridge", "drives"])
 def test_mail_of_bridge_and_drives_on_a_wall_clock(index: int) -> None:
     plan, messages = story("can.path=closed")
@@ -249,6 +250,7 @@ def batched(payloads: list[bytes]) -> Iterator[bytes]:
         yield join(payloads[at : at + 50])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("virtual", [True, False])
 @pytest.mark.parametrize("who", ["recorder", "closed recorder", "mirroring bridge"])
 def test_receivers_of_copies(who: str, virtual: bool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,6 +290,7 @@ def test_receivers_of_copies(who: str, virtual: bool, monkeypatch: pytest.Monkey
     assert not copies.reception.finish()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("virtual", [True, False])
 def test_a_recording_takes_whatever_is_admitted(virtual: bool, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Batches and messages with some bits turned: what is admitted can be recorded."""

@@ -150,6 +150,7 @@ def in_virtual_time(plan: Plan, index: int, folder: Path) -> list[Act]:
     return acts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("member", ["g1/r1", "g1", "coordinator"])
 @pytest.mark.parametrize("timing", ["event_driven", "time_driven"])
 @pytest.mark.parametrize("links", ["links=[]", TIMES_OUT, DELAYED], ids=["ideal", "times out", "delayed"])

@@ -93,6 +93,7 @@ def test_values_that_are_not_contiguous_are_encoded_in_order():
     assert decode(encode(Message(Channel.STATE, 0, 0, 0, values[::2]))).values.tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
 
 
+@pytest.mark.slow
 @settings(max_examples=2000)
 @given(st.binary(max_size=80) | st.binary(max_size=60).map(lambda tail: VALID[:32] + tail))
 def test_random_bytes_are_a_message_or_refused(payload):

@@ -90,6 +90,7 @@ with can.Bus(sys.argv[1], interface="udp_multicast", port=int(sys.argv[2]), igno
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
 def test_only_this_host_is_heard_and_others_are_named(hosts: Hosts, group: str) -> None:
     victims = [HERE] if "." in group else []

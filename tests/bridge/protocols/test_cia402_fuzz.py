@@ -59,6 +59,7 @@ def mutated(random: Random, frame: Frame) -> Frame:
     return Frame(can_id, data, remote)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_drive(seed: int) -> None:
     random = Random(seed)

@@ -323,6 +323,7 @@ def random_frames(seed: int, number: int, own: int, others: tuple[int, ...]) -> 
 WHOLE_FRAMES = (*Refusal, REMOTE, REPEATED)
 
 
+@pytest.mark.slow
 def test_whatever_comes_the_drive_gives_no_torque_unless_enabled() -> None:
     drive, time_ns, number = NativeDrive(PLAN), 0, 120_000
     drive.advance(0)
@@ -351,6 +352,7 @@ def test_whatever_comes_the_drive_gives_no_torque_unless_enabled() -> None:
     assert accepted > number / 3
 
 
+@pytest.mark.slow
 def test_whatever_comes_the_host_survives_and_counts() -> None:
     host, number = NativeHost(drive_plan("native", recover_ns=50 * MS)), 120_000
     others = (0, 0x103, 0x184, 0x7FF)

@@ -360,6 +360,7 @@ def test_what_is_refused_is_counted_and_is_no_sign_of_life(reason: str, bad: Fra
     assert host.fault == "right: silent"
 
 
+@pytest.mark.slow
 def test_whatever_comes_nothing_raises_and_torque_only_while_enabled() -> None:
     dice = random.Random(5)
     host = ODriveHost(drive_plan("odrive", (1, 2), recover_ns=50 * MS))

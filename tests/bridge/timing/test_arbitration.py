@@ -236,6 +236,7 @@ def test_arbitration_bit_by_bit(script: Script, capacity: int) -> None:
     compare(script, capacity, 0, 500)
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(
     st.lists(
@@ -251,6 +252,7 @@ def test_errors_bit_by_bit(script: Script, capacity: int, restart_bits: int, rat
     compare([(0, rate), *script, (rest_bits, None)], capacity, restart_bits, 1000)
 
 
+@pytest.mark.slow
 def test_errors_of_all_kinds_bit_by_bit() -> None:
     kinds: Counter[BusEventKind] = Counter()
     lost = 0

@@ -11,6 +11,7 @@ from support.runs import plan_of
 SECONDS = 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("protocol", "robots_on_bus"), [("native", 9), ("odrive", 3), ("cia402", 3)])
 def test_cyclic_identifiers_come_as_often_and_wait_no_longer_than_the_fit_says(
     protocol: str, robots_on_bus: int

@@ -442,7 +442,7 @@ def test_a_stopped_process_is_named_and_the_run_given_up(tmp_path: Path) -> None
     assert not Path(f"/proc/{stopped[0]}").exists()
 
 
-@pytest.mark.parametrize("name", ["recorder", "bridge", "g1"])
+@pytest.mark.parametrize("name", ["recorder", "g1"])
 def test_a_process_that_stands_still_for_a_while_costs_only_time(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -125,6 +125,7 @@ def test_ids_are_unique_or_repeat_the_same_thing(both):
     assert used == ids
 
 
+@pytest.mark.slow
 def test_every_figure_has_words_for_those_who_do_not_see_it(single, both):
     for page, figures in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):
         labels = [value for tag, key, value in page.attributes if (tag, key) == ("svg", "aria-label")]

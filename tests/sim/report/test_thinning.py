@@ -112,6 +112,7 @@ def drawn(instants: int) -> dict[str, int]:
     return peaks
 
 
+@pytest.mark.slow
 def test_the_figures_of_a_long_run_take_no_more_memory_than_those_of_a_short_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -79,6 +79,7 @@ def test_settling_times_are_those_of_the_closed_form(lab, answer, fraction):
         assert 0 <= times[block.name] - exact <= PERIOD_NS / 1e9 + 1e-4 * block.sigma, block.name
 
 
+@pytest.mark.slow
 def test_no_run_that_is_cut_off_settles_before_its_time(lab, answer):
     """An oscillating error passes through its band; a run that ends there has not settled."""
     whole = settled_s(answer, 0.05)

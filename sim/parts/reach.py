@@ -34,8 +34,6 @@ PATIENCE_S: Final = 0.5
 """Time limit for that; without an answer there is no bound [s]"""
 IDLE_NS: Final = 500_000_000
 """A robot without torque for this time is not driven [ns]"""
-LOOK_NS: Final = 50_000_000
-"""A robot is looked at once in this time [ns]"""
 _RIGHT, _LEFT, _SATURATED = map(STATE_FIELDS.index, ("tau_right", "tau_left", "saturated"))
 DIVERGED: Final = f"more than {FACTOR:g} times as far as its start, its place in the formation and the trajectory ask"
 
@@ -80,8 +78,6 @@ class ReachWatch:
         """How far each robot is from where the trajectory begins [m]"""
         self._driven_ns = [0] * count
         """When each robot had torque last"""
-        self._due_ns = [0] * count
-        """When each robot is looked at next"""
         self._excused = 0.0
         """How far robots got while one was not driven [m]"""
         self._time_ns = 0
@@ -91,9 +87,8 @@ class ReachWatch:
         robot, the instant [ns], and how far it is [m]; None if there is none."""
         x, y = self._reach.x, self._reach.y
         for message in messages:
-            if message.channel is not Channel.STATE or message.time_ns < self._due_ns[message.source]:
+            if message.channel is not Channel.STATE:
                 continue
-            self._due_ns[message.source] = message.time_ns + LOOK_NS
             if message.time_ns > self._time_ns:
                 if (found := self._beyond()) is not None:
                     return found

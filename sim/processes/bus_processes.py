@@ -77,6 +77,7 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
             publisher.put(join(frames[at : at + BATCH]))
 
     said_s = time.monotonic()
+    watch.pulse.beat(round(said_s * 1e9), round((said_s + PROGRESS_S) * 1e9))
     order = None
     try:
         while order is None:

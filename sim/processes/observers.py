@@ -38,6 +38,8 @@ def run_observers(spec: ProcessSpec, session: Session, control: Connection, watc
     with outside:
         outside.declare_token(gate_token(spec.run))
         reception.begin(meet(spec, session, control))
+        now_s = time.monotonic()
+        watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
         while (order := hear_finish(control)) is None:
             give(reception.take(PROGRESS_S / 2))
             now_s = time.monotonic()

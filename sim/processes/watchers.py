@@ -149,6 +149,7 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection, watch
         raise StartError(f"{error.filename}: {error.strerror}") from None
     reception.begin(meet(spec, session, control))
     said_s = time.monotonic()
+    watch.pulse.beat(round(said_s * 1e9), round((said_s + PROGRESS_S) * 1e9))
     while True:
         recording.add(reception.take(HOLD_S))
         recording.recorder.flush_if_due(time.monotonic_ns())

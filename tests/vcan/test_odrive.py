@@ -58,15 +58,19 @@ class Client:
         self.speed = message.data["Vel_Estimate"]
 
     async def push(self, torque: float, until: Callable[[], bool]) -> None:
-        """Commands a torque every 20 ms until a condition holds; brings the drive up again if its watchdog has expired."""
+        """Commands a torque every 20 ms until a condition holds; brings the drive up again if its watchdog has expired.
+
+        It may expire again before the first command, which must be zero, and an error that is cleared at once is not seen."""
         deadline_s = time.monotonic() + LIMIT_S
         while not until():
-            assert time.monotonic() < deadline_s
-            if fault := self._fault():
-                assert "WATCHDOG_TIMER_EXPIRED" in fault
+            assert time.monotonic() < deadline_s, (self.drive.axis_state, self.speed, self.late)
+            fault = self._fault()
+            assert not fault or "WATCHDOG_TIMER_EXPIRED" in fault
+            if fault or self.drive.axis_state == "IDLE":
                 self.late = True
                 self.drive.clear_errors()
                 await self.drive.set_axis_state("CLOSED_LOOP_CONTROL")
+            if self.late:
                 self.drive.set_input_torque(0.0)
             self.drive.set_input_torque(torque)
             await asyncio.sleep(0.02)

@@ -18,7 +18,7 @@ from echelon.errors import UserError
 from echelon.files import is_locked, lock, write_text
 from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
-from echelon.sim.judged_log import judged
+from echelon.sim.judged_log import Terms, judged
 from echelon.sim.out_folder import CUT, RECORDING, REPORT, SUMMARY, note_again
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import (
@@ -194,5 +194,5 @@ def _report_of_log(plan: Plan, log: Path, clock: str) -> CanReport:
         log_lost=None,
         log_error=None,
         robots={},
-        referee=judged(log, plan, clock, whole=False) if frames else None,
+        referee=judged(log, plan, Terms.of(plan, clock, whole=False)) if frames else None,
     )

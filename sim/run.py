@@ -28,7 +28,7 @@ from echelon.scenario.tables import Scenario
 from echelon.shipped import EFFECTIVE
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.interruption import Interruption, Raises, interruption
-from echelon.sim.judged_log import judged, until_ns
+from echelon.sim.judged_log import Terms, judged, until_ns
 from echelon.sim.kept_parts import keep_parts
 from echelon.sim.observing import TICKET
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
@@ -129,7 +129,8 @@ def execute(
     # a referee that listens does not know when a run breaks off
     if can is not None and (can.referee is None or not whole):
         try:
-            can = replace(can, referee=judged(folder / LOG, plan, clock, whole, until_ns(plan, outcome)))
+            terms = Terms.of(plan, clock, whole, until_ns(plan, outcome))
+            can = replace(can, referee=judged(folder / LOG, plan, terms))
         except PartRunError as error:
             outcome.failure = outcome.failure or str(error)
     display.close()

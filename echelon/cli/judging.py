@@ -4,7 +4,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from echelon.bridge.can.candump import BACKWARDS
 from echelon.bridge.referee.log import judge_log, names_in
@@ -15,32 +14,13 @@ from echelon.cli.frame_sources import listen, open_buses
 from echelon.errors import UsageError
 from echelon.files import read_json
 from echelon.plan.plan import Plan
+from echelon.sim.judged_log import Terms, judged
 from echelon.sim.run_state import goes_on, read_state
 from echelon.sim.view.wheel_table import finding_text
 
 
-class Terms(NamedTuple):
-    """The terms on which the frames of a run are judged."""
-
-    tolerance_ns: int | None
-    """How late a cyclic frame may be [ns]; None: as the referee has it"""
-    whole: bool
-    """True if the log must go to the end of the run.  Of a run that goes on, was stopped or broke off it need not"""
-    until_ns: int | None
-    """Run time up to which frames are judged [ns], if the run was stopped or broke off: what its stop sends is no finding"""
-    end_ns: int | None
-    """End of a run on a wall clock [ns]: later frames are no findings, either"""
-
-    @property
-    def last_ns(self) -> int | None:
-        """Run time up to which frames are judged [ns]; None: all are."""
-        return self.end_ns if self.until_ns is None else self.until_ns
-
-
 def terms_of(folder: Path, plan: Plan) -> Terms:
-    """Returns the terms for a run's can.log, by what its folder says: they are those of the run itself.
-
-    On a wall clock processes may be late, so frames may be, too."""
+    """Returns the terms for a run's can.log, by what its folder says: they are those of the run itself."""
     state = read_state(folder)
     try:
         summary = read_json((folder / "summary.json").read_bytes())
@@ -52,18 +32,15 @@ def terms_of(folder: Path, plan: Plan) -> Terms:
     clock = run.get("clock") or (state.clock if state else "")
     whole = not (run.get("failure") or run.get("stopped") or goes_on(folder))
     until_ns = round(until_s * 1e9) if isinstance(until_s, int | float) and abs(until_s) < 1e9 else None
-    wall = clock == "wall"
-    tolerance_ns, end_ns = (plan.can.watchdog_ns // 2, plan.duration_ns) if wall else (None, None)
-    return Terms(tolerance_ns, whole, until_ns, end_ns)
+    return Terms.of(plan, clock, whole, until_ns)
 
 
 def judge_run(plan: Plan, folder: Path) -> RefereeReport:
     """Returns what the referee finds in a run's can.log; of a run that goes on, in what it holds so far.
 
     Raises UsageError if the log cannot be read, or holds things but no frame of the plan."""
-    terms = terms_of(folder, plan)
     try:
-        report = judge_log(folder / LOG, plan, **terms._asdict())
+        report = judged(folder / LOG, plan, terms_of(folder, plan))
     except OSError as error:
         raise UsageError(f"{folder / LOG}: {error.strerror}") from None
     if report.left_out and not report.frames:

@@ -12,8 +12,9 @@ from rich.text import Text
 
 from echelon.bridge.referee.referee import Referee
 from echelon.cli.frame_sources import Heard, follow, listen, open_buses, read_log, replay
-from echelon.cli.judging import Terms, terms_of
+from echelon.cli.judging import terms_of
 from echelon.plan.plan import Plan
+from echelon.sim.judged_log import Terms
 from echelon.sim.run_state import goes_on
 from echelon.sim.view.wheel_table import CanTable
 

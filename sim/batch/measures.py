@@ -76,10 +76,10 @@ def measure(
             norm = sqrt((real[centroid] - x) ** 2 + (real[centroid + 1] - y) ** 2)
             _note_error(run, blocks[len(blocks) - 1], table, real, whole, norm, time_ns, step_ns)
     if step_ns > 0:
-        _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+        note_distances(run, len(robots), real, whole, time_ns, step_ns)
     copy(real, places, run.before_at, 2 * len(robots))
     if step_ns == 0:
-        _note_distances(run, len(robots), real, whole, time_ns, step_ns)
+        note_distances(run, len(robots), real, whole, time_ns, step_ns)
 
 
 @fused
@@ -146,7 +146,7 @@ def _note_error(
 
 
 @fused
-def _note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
+def note_distances(run: Any, robots: int, real: Any, whole: Any, time_ns: int, step_ns: int) -> None:
     """Notes how close robots came since the last instant, on straight lines (sim.results.distances).
 
     Pairs are looked at only if one of them may have come as near as counts.  Two robots come nearer to each other by at most

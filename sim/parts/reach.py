@@ -22,7 +22,7 @@ import numpy as np
 from echelon.controller.trajectory import make_trajectory
 from echelon.controller.transformation import Transformation
 from echelon.errors import PartRunError
-from echelon.messages import STATE_FIELDS, Channel, Message
+from echelon.messages import STATE_FIELDS, Message
 from echelon.plan.plan import Plan
 from echelon.sim.parts.time_limit import no_longer
 
@@ -82,23 +82,20 @@ class ReachWatch:
         """How far robots got while one was not driven [m]"""
         self._time_ns = 0
 
-    def first(self, messages: Sequence[Message]) -> tuple[int, int, float] | None:
-        """Returns the first instant of which all messages have come, and at which a robot is beyond its reach: the index of the
+    def first(self, states: Sequence[Message]) -> tuple[int, int, float] | None:
+        """Returns the first instant of which all states have come, and at which a robot is beyond its reach: the index of the
         robot, the instant [ns], and how far it is [m]; None if there is none."""
         x, y = self._reach.x, self._reach.y
-        for message in messages:
-            if message.channel is not Channel.STATE:
-                continue
-            if message.time_ns > self._time_ns:
+        for _, source, _, time_ns, values in states:
+            if time_ns > self._time_ns:
                 if (found := self._beyond()) is not None:
                     return found
-                self._time_ns = message.time_ns
-            values, source = message.values, message.source
+                self._time_ns = time_ns
             self._far[source] = hypot(values[0] - x, values[1] - y)
-            if message.time_ns - self._driven_ns[source] > IDLE_NS:
+            if time_ns - self._driven_ns[source] > IDLE_NS:
                 self._excused = max(self._excused, self._far[source])
             if values[_RIGHT] or values[_LEFT] or values[_SATURATED]:
-                self._driven_ns[source] = message.time_ns
+                self._driven_ns[source] = time_ns
         return None
 
     def _beyond(self) -> tuple[int, int, float] | None:

@@ -77,15 +77,14 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
             publisher.put(join(frames[at : at + BATCH]))
 
     said_s = time.monotonic()
-    watch.pulse.beat(round(said_s * 1e9), round((said_s + PROGRESS_S) * 1e9))
     order = None
     try:
         while order is None:
+            watch.pulse.at_work(PROGRESS_S)
             take(reception.take(PROGRESS_S / 2))
             if watch.asked:
                 stop()  # from here on the bridge makes no frames, but robots must not wait for it
             now_s = time.monotonic()
-            watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
             if now_s - said_s >= PROGRESS_S:
                 said_s = now_s
                 bridge.flush()

@@ -1,6 +1,5 @@
 """The process `observers`: it receives copies of all messages of a run and gives them on to those who may only read."""
 
-import time
 from multiprocessing.connection import Connection
 
 from echelon.messages import Channel, Message
@@ -38,12 +37,11 @@ def run_observers(spec: ProcessSpec, session: Session, control: Connection, watc
     with outside:
         outside.declare_token(gate_token(spec.run))
         reception.begin(meet(spec, session, control))
-        now_s = time.monotonic()
-        watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
-        while (order := hear_finish(control)) is None:
+        order = None
+        while order is None:
+            watch.pulse.at_work(PROGRESS_S)
             give(reception.take(PROGRESS_S / 2))
-            now_s = time.monotonic()
-            watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
+            order = hear_finish(control)
         watch.pulse.rest()
         for messages in reception.drain(order.messages):
             give(messages)

@@ -6,6 +6,7 @@ how long, without any message, which a frozen process could not send.  The memor
 
 import mmap
 import os
+import time
 from dataclasses import dataclass
 from multiprocessing.reduction import DupFd
 from typing import Any, Final
@@ -37,6 +38,11 @@ class Pulse:
         """Says that the process is at work at `now_ns`, and will be again at `due_ns` at the latest."""
         self.late(now_ns)
         self._cells[self._at] = due_ns
+
+    def at_work(self, for_s: float) -> None:
+        """Says that the process is at work now, and will be again within `for_s` [s]."""
+        now_ns = time.monotonic_ns()
+        self.beat(now_ns, now_ns + round(for_s * 1e9))
 
     def late(self, now_ns: int) -> None:
         """Notes by how much the process is late, if it never was by more."""

@@ -6,7 +6,7 @@ the wheels for good; where the drives recover, for `RECOVER_S`.  Others are name
 `standstill` fails the verdict.  A robot, leader or coordinator that stands still for the stall timeout ends the run.
 
 In virtual time every member waits for the messages of others, so one process that stands still stops all.  A member that waits
-says so every now and then; a member that says nothing is the one that everyone waits for, or a watcher without a pulse.
+says so every now and then; everyone waits for a member that says nothing, or for a watcher that is late by its pulse.
 """
 
 import math
@@ -106,9 +106,8 @@ class StallWatch:
 
         `now_s` is on the monotonic clock [s].  Raises StallError after `stall_timeout_s` without progress."""
         at = (self._progress.time_ns, max((child.waiting_ns for child in self._children), default=-1))
-        if at != self._moved_at and not self._watchers_late_by(
-            STANDSTILL_S, now_s
-        ):  # members may run ahead of a watcher
+        waited_for = self._watchers_late_by(STANDSTILL_S, now_s)  # members may run ahead of a watcher
+        if at != self._moved_at and not waited_for:
             self._moved_at, self._moved_s = at, now_s
             if self._warned:
                 self._warned, self._progress.note = False, "goes on"
@@ -137,7 +136,8 @@ class StallWatch:
         """Returns in words which processes everyone waits for: the silent ones, or else who waits for whom.
 
         A watcher that stands still, by its pulse, comes first: members may be silent only because it does not take their
-        messages.  One that is waited for, and waits for nobody, works or hangs, even if a thread of it still speaks."""
+        messages.  One that is waited for, and waits for nobody, works or hangs, even if a thread of it still speaks.  If there
+        is no such process, everyone waits for those that the kernel has stopped."""
         quiet = [child for child in self._children if now_s - child.heard_s > SILENT_S]
         silent = self._watchers_late_by(SILENT_S, now_s)
         silent = silent or [child for child in quiet if child.is_member and child.done is None]
@@ -147,6 +147,7 @@ class StallWatch:
             for child in self._children
             if child.spec.index in awaited and child.is_member and child.done is None and not _waits(child, now_s)
         ]
+        silent = silent or [child for child in self._children if child.state() == "stopped"]
         if silent:
             return "everyone waits for " + few(
                 [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent]

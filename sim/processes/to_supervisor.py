@@ -8,7 +8,6 @@ from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
 from echelon.runtime.runner import RunnerCounts
-from echelon.sim.parts.reach import DIVERGED
 from echelon.sim.results.trace import Array, Trace
 
 
@@ -60,6 +59,8 @@ class Lost:
     def text(self, plan: Plan) -> str:
         """Returns it in words."""
         if self.far is not None:
+            from echelon.sim.parts.reach import DIVERGED  # most processes never say it
+
             who, when = plan.robots[self.robot].name, f"{self.time_ns / 1e9:g} s"
             return f"{who} has diverged: at {when} it is {self.far:.3g} m from where the trajectory begins, {DIVERGED}"
         what = "beyond all bounds" if self.finite else "not finite"

@@ -128,8 +128,7 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection, w
     watch.pulse.from_ns = meet(spec, session, control)
     clock = RunClock(watch.pulse.from_ns)
     while hear_finish(control) is None:
-        now_ns = time.monotonic_ns()
-        watch.pulse.beat(now_ns, now_ns + PROGRESS_NS)
+        watch.pulse.at_work(PROGRESS_NS / 1e9)
         wait_for([control], LISTEN_NS)  # not for each frame: the kernel stamps them
         for number, bus in enumerate(buses):
             for received in drained(bus):

@@ -149,12 +149,11 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection, watch
         raise StartError(f"{error.filename}: {error.strerror}") from None
     reception.begin(meet(spec, session, control))
     said_s = time.monotonic()
-    watch.pulse.beat(round(said_s * 1e9), round((said_s + PROGRESS_S) * 1e9))
     while True:
+        watch.pulse.at_work(PROGRESS_S)
         recording.add(reception.take(HOLD_S))
         recording.recorder.flush_if_due(time.monotonic_ns())
         now_s = time.monotonic()
-        watch.pulse.beat(round(now_s * 1e9), round((now_s + PROGRESS_S) * 1e9))
         if now_s - said_s >= PROGRESS_S:
             said_s = now_s
             tell(control, recording.progress())
@@ -204,10 +203,10 @@ class RunRecorder:
         """Takes messages in order of time."""
         recorder, trace = self.recorder, self._trace
         if self.lost is None and self._reach is not None:
-            self.lost = _first_lost(messages)
-            if (beyond := self._reach.first(messages)) is not None and (
-                self.lost is None or beyond[1] < self.lost.time_ns
-            ):
+            states = [message for message in messages if message.channel is Channel.STATE]
+            self.lost = _first_lost(states)
+            beyond = self._reach.first(states)
+            if beyond is not None and (self.lost is None or beyond[1] < self.lost.time_ns):
                 robot, time_ns, far = beyond
                 self.lost = Lost(robot, time_ns, True, far)
         if self.lost is not None:
@@ -255,9 +254,8 @@ class RunRecorder:
         return self.recorder.failure or self._trace.failure
 
 
-def _first_lost(messages: Sequence[Message]) -> Lost | None:
+def _first_lost(states: Sequence[Message]) -> Lost | None:
     """Returns the first state that is not finite or beyond all bounds; None if all are within."""
-    states = [message for message in messages if message.channel is Channel.STATE]
     if not states or within(np.concatenate([state.values for state in states])):
         return None
     for state in states:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from echelon.bridge.can.bus import Received, open_bus
+from echelon.bridge.can.bus import Bus, Received, open_bus
 from echelon.bridge.can.bus_url import free_multicast_url
 from echelon.bridge.can.guard import KEPT, NODE, OTHERS, Guard
 from echelon.bridge.frame_message import BRIDGE_NODE, TimedFrame
@@ -122,6 +122,13 @@ def url_of(kind: str, name: str) -> str:
     return free_multicast_url() if kind == "udp_multicast" else f"virtual:{name}"
 
 
+def heard_last(listener: Bus) -> None:
+    """Waits for the frame with the data `x`, the last one: then all frames have come."""
+    while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
+        pass
+    assert heard is not None
+
+
 @BUSES
 def test_drives_in_lockstep_name_who_spoke_for_them_while_they_stopped(kind: str) -> None:
     """What the bridge sends then is no intrusion, nor is what it had sent before and they have not taken yet."""
@@ -136,9 +143,7 @@ def test_drives_in_lockstep_name_who_spoke_for_them_while_they_stopped(kind: str
         for _ in range(2 * AT_ONCE):
             stranger.send(0x100, bytes(8))
         stranger.send(sent[0], b"x")
-        while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
-            pass
-        assert heard is not None  # so all have come
+        heard_last(listener)
         drives.stop()
         drives.close()
     (one,) = drives.report().intrusions
@@ -158,9 +163,7 @@ def test_a_bridge_in_virtual_time_looks_a_last_time_before_it_closes_its_buses(
         bridge.rail.put([TimedFrame(0, 0, BRIDGE_NODE, Frame(0x100, bytes(8)))])
         stranger.send(0x180, bytes(8))
         stranger.send(0x100, b"x")
-        while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
-            pass
-        assert heard is not None  # so both have come
+        heard_last(listener)
         bridge.stop()
         bridge.close()
     (one,) = bridge.report().intrusions
@@ -176,9 +179,7 @@ def test_a_bridge_on_a_wall_clock_looks_a_last_time_before_it_closes_its_buses(t
             bridge.serve()
         bridge.stop()
         stranger.send(heard.can_id, b"x")
-        while (heard := listener.recv(60.0)) is not None and heard.data != b"x":
-            pass
-        assert heard is not None  # so it has come
+        heard_last(listener)
         bridge.close()
     (one,) = bridge.report().intrusions
     assert (one.id, one.frames) == (f"{heard.can_id:03X}", 1)

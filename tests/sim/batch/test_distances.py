@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from echelon.sim.batch import records as r
-from echelon.sim.batch.measures import _note_distances
+from echelon.sim.batch.measures import note_distances
 from echelon.sim.batch.pools import Pools, records_of
 
 RADIUS = 0.3
@@ -50,7 +50,7 @@ def noted(walks: NDArray[np.float64]) -> tuple[float, int]:
     real[before] = walks[0].ravel()
     for number, instant in enumerate(walks):
         real[now] = instant.ravel()
-        _note_distances(run, robots, real, whole, number * 1000, 1000 if number else 0)
+        note_distances(run, robots, real, whole, number * 1000, 1000 if number else 0)
         real[before] = real[now]
     return float(np.sqrt(real[run.distance_at])), int(whole[run.closest_at + 3])
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from echelon.sim.processes.failures import RunError
+from echelon.sim.processes.failures import RunError, StallError
 from echelon.sim.processes.outcome import Progress
-from echelon.sim.processes.stalls import StandstillWatch
+from echelon.sim.processes.pulse import Pulse
+from echelon.sim.processes.stalls import StallWatch, StandstillWatch
 from support.runs import plan_of
 
 S = 1_000_000_000
@@ -64,3 +65,33 @@ def test_a_watcher_that_stands_still_is_named_and_the_run_goes_on() -> None:
     for tenths in range(1, 100):
         found.check(now_ns + tenths * S // 10)
     assert "recorder stands still, for " in found._progress.note
+
+
+def stalled(beats: bool, state: str) -> str:
+    """Returns why a run in virtual time is given up whose recorder has this state, and all of whose members are at work."""
+    now_s = time.monotonic()
+    pulse = Pulse(memoryview(bytearray(8 * 8)).cast("q"), 0)
+    if beats:
+        pulse.at_work(0.1)
+    spec = SimpleNamespace(index=0)
+    common = {"spec": spec, "waiting_ns": -1, "waiting_for": (), "waiting_s": 0.0, "done": None, "runs": str}
+    process = SimpleNamespace(pid=os.getpid())
+    recorder: Any = SimpleNamespace(
+        name="recorder", is_member=False, heard_s=now_s, pulse=pulse, state=lambda: state, process=process, **common
+    )
+    robot: Any = SimpleNamespace(
+        name="r1", is_member=True, heard_s=now_s + 100, pulse=pulse, state=lambda: "sleeping", process=process, **common
+    )
+    watch = StallWatch(plan_of("lab"), [recorder, robot], Progress(phase="running", started_s=now_s), 4.0)
+    watch.check(now_s)
+    with pytest.raises(StallError) as error:
+        watch.check(now_s + 20.0)
+    return str(error.value)
+
+
+def test_a_watcher_in_virtual_time_is_named_by_its_pulse() -> None:
+    assert "everyone waits for recorder" in stalled(beats=True, state="sleeping")
+
+
+def test_a_watcher_that_was_stopped_before_its_pulse_began_is_named_too() -> None:
+    assert "everyone waits for recorder" in stalled(beats=False, state="stopped")

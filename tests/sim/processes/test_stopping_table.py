@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 
 import pytest
 
-from echelon.sim.processes.stalls import BREAK_S
 from support.late import Lateness, lateness
-from support.runs import session_members, until
-from support.stopped import SCENARIO, WATCHDOG_S, Ear, running, whom
+from support.runs import session_members, summary_of, until
+from support.stopped import SCENARIO, Ear, running, whom
+from support.stopping_table import AT_ONCE, HITS, KINDS, ON, STALL_S, TABLE, ZERO, Out
 
 pytestmark = pytest.mark.slow
 TEAM: Final = (
@@ -30,88 +30,11 @@ TEAM: Final = (
 )
 """A leader between coordinator and robot; few frames a second, so that runs beside each other do not fill the machine"""
 MIRRORED: Final = TEAM.replace('path = "closed", ', "")
-AT_ONCE: Final = 0.5
-"""Some processes hear of it, one after the other, and some frames go over the bus [s]"""
-WATCHDOG: Final = WATCHDOG_S + AT_ONCE
-STALL_S: Final = 4.0
-"""Stall timeout of the runs in which somebody stands still for ever in virtual time: after the first warning [s]"""
-WAITING_S: Final = 1.5
-"""After so long members have said that they wait, and the supervisor has looked [s]"""
 CALM_S: Final = 0.2
 """A machine that lets a process wait for longer proves nothing about a run that fails: it is tried again [s]"""
 TRIES: Final = 3
 STARTING: Final = threading.Semaphore(2)
 """Runs that start beside each other; others would be late"""
-
-
-class Out(NamedTuple):
-    """What comes of a hit."""
-
-    zero_s: float | None = None
-    """After so long no wheel has torque, and none is commanded; None: nobody stops the wheels"""
-    code: int | None = None
-    """Exit code of the run; None: it goes on"""
-    said: str = ""
-    """What the run says about {who}; "" if it says nothing"""
-    silent: bool = False
-    """True: nobody sends a frame until the process goes on"""
-
-
-ASKED: Final = Out(AT_ONCE, 3, "{who} was asked to end (SIG{signal})")
-INTERRUPTED: Final = Out(AT_ONCE, 3, "echelon: interrupted")
-LOST: Final = Out(AT_ONCE, 3, "lost {who} (killed by SIGKILL)")
-GONE: Final = Out(AT_ONCE, -signal.SIGKILL)
-ON: Final = Out()
-NAMED: Final = Out(said="{who} stands still, for ")
-ZERO: Final = NAMED._replace(zero_s=WATCHDOG)
-BREAKS: Final = NAMED._replace(zero_s=max(WATCHDOG_S, BREAK_S) + 2 * AT_ONCE, code=3)
-WAITS: Final = Out(silent=True)
-AWAITED: Final = Out(said="everyone waits for {name} ", silent=True)
-STALLS: Final = Out(STALL_S + WAITING_S + 2 * AT_ONCE, 3, "everyone waits for {name} ")
-AHEAD: Final = AWAITED._replace(silent=False)
-"""Members run ahead of a watcher"""
-NO_ROW: Final = None
-
-HITS: Final = ("KILL", "TERM", "HUP", "INT", "STOP 0.2", "STOP 2", "STOP 20", "STOP")
-"""`STOP 2`: stands still for 2 s; `STOP`: for ever"""
-SIGNALS: Final = (ASKED, ASKED, NO_ROW)
-TABLE: Final[dict[str, dict[str, tuple[Out | None, ...]]]] = {
-    "wall": {
-        # 0.2 s is below the watchdog: the drives go on with the last torque, as they do in any period
-        "supervisor": (GONE, INTERRUPTED, INTERRUPTED, INTERRUPTED, ON, ON, ON, ON),
-        "team/solo": (LOST, *SIGNALS, ON, ZERO, ZERO, ZERO),
-        "team": (LOST, *SIGNALS, ON, ZERO, ZERO, ZERO),
-        "coordinator": (LOST, *SIGNALS, ON, ZERO, ZERO, ZERO),
-        "bridge": (LOST._replace(zero_s=WATCHDOG), ASKED, ASKED, ASKED, ON, BREAKS, BREAKS, BREAKS),
-        "drives": (LOST, *SIGNALS, ON, BREAKS, BREAKS, BREAKS),
-        "recorder": (LOST, *SIGNALS, ON, NAMED, NAMED, NAMED),
-        "referee": (LOST, *SIGNALS, ON, NAMED, NAMED, NAMED),
-        "observers": (LOST, *SIGNALS, ON, NAMED, NAMED, NAMED),
-        "all": (NO_ROW, INTERRUPTED, INTERRUPTED, INTERRUPTED),
-        "all twice": (NO_ROW, INTERRUPTED, INTERRUPTED, INTERRUPTED),
-    },
-    "virtual": {
-        # all wait for who stands still, and so does the time of the wheels
-        "supervisor": (GONE, INTERRUPTED, INTERRUPTED, INTERRUPTED, ON, ON, ON, ON),
-        "team/solo": (LOST, *SIGNALS, ON, WAITS, AWAITED, STALLS),
-        "team": (LOST, *SIGNALS, ON, WAITS, AWAITED, STALLS),
-        "coordinator": (LOST, *SIGNALS, ON, WAITS, AWAITED, STALLS),
-        "bridge": (LOST, ASKED, ASKED, ASKED, ON, WAITS, AWAITED, STALLS),
-        "drives": (LOST, *SIGNALS, ON, WAITS, AWAITED, STALLS),
-        "recorder": (LOST, *SIGNALS, ON, ON, AHEAD, STALLS),
-        "observers": (LOST, *SIGNALS, ON, ON, AHEAD, STALLS),
-        "all": (NO_ROW, INTERRUPTED, INTERRUPTED, INTERRUPTED),
-        "all twice": (NO_ROW, INTERRUPTED, INTERRUPTED, INTERRUPTED),
-    },
-    "mirrored, wall": {
-        # no drives on the bus report; what counts is what the bridge commands
-        "bridge": (LOST, ASKED, ASKED, NO_ROW, ON, NAMED._replace(silent=True), NO_ROW, NAMED._replace(silent=True)),
-    },
-    "mirrored, virtual": {
-        "bridge": (LOST, ASKED, ASKED, NO_ROW, ON, WAITS, AWAITED, STALLS),
-    },
-}
-KINDS: Final = {"team/solo": "robot team/solo", "team": "leader team"}
 
 
 class Cell(NamedTuple):
@@ -274,6 +197,10 @@ def attempt(folder: Path, clock: str, cells: Sequence[Cell], machine: Lateness) 
             assert run.has_said(last.said) or not last.said
             if last.out.code is None and last.who != "supervisor":
                 assert run.has_said("echelon: interrupted")
+            if last.out == ZERO:
+                checks = {each["name"]: each for each in summary_of(folder / "run")["verdict"]["checks"]}
+                assert checks["standstill"]["outcome"] == "failed"
+                assert f"{last.who} for " in checks["standstill"]["text"]
 
 
 @contextmanager

@@ -5,20 +5,15 @@ The summary has no values for what was not written: wall time, counts of links, 
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from echelon.bridge.protocols.plan_dbc import dbc_names, plan_dbc
-from echelon.bridge.referee.log import read_run_log
-from echelon.bridge.reports import BusReport, CanReport
-from echelon.bridge.timing.bus_load import BitCount
-from echelon.bridge.timing.buses import scheduled
-from echelon.bridge.timing.fit import plan_fit
 from echelon.errors import UserError
 from echelon.files import is_locked, lock, write_text
-from echelon.plan.plan import Plan
 from echelon.shipped import EFFECTIVE
 from echelon.sim.judged_log import Terms, judged
+from echelon.sim.log_report import report_of_log
 from echelon.sim.out_folder import CUT, RECORDING, REPORT, SUMMARY, note_again
 from echelon.sim.parts.loading import load
 from echelon.sim.recording.mcap_reader import (
@@ -132,8 +127,9 @@ def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
     )
     log, can = folder / "can.log", None
     if log.exists():
-        _drop_cut_line(log)
-        can = _report_of_log(plan, log, facts.clock)
+        can = report_of_log(plan, log)
+        if can.frames:
+            can = replace(can, referee=judged(log, plan, Terms.of(plan, facts.clock, whole=False)))
         for bus, name in enumerate(dbc_names(plan)):
             if not (folder / name).exists():
                 write_text(folder / name, plan_dbc(plan, bus))
@@ -152,47 +148,3 @@ def _failure(trace: Trace, result: RecoverResult, counted: bool) -> str:
         return f"broken off before its summary was written; this one is rebuilt from the recording{links}"
     until = f"the recording ends at {until_ns / 1e9:g} s of {trace.plan.duration_ns / 1e9:g} s"
     return f"broken off: {until}; this summary is rebuilt from it{links}"
-
-
-def _drop_cut_line(log: Path) -> None:
-    """Removes an unfinished last line: half a frame may look like a frame with less data."""
-    content = log.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        os.truncate(log, whole)
-
-
-def _report_of_log(plan: Plan, log: Path, clock: str) -> CanReport:
-    """Returns the report on the buses, as far as can.log shows it; counts that it does not show are None."""
-    counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, 0
-    for time_ns, bus, (can_id, data, remote) in read_run_log(log, plan):
-        counts[bus].add(can_id, data, remote)
-        frames, last_ns = frames + 1, max(last_ns, time_ns)
-    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
-    seconds = max(last_ns + start_ns, 1) / 1e9
-    buses = tuple(
-        BusReport(bus.name, bus.bitrate, count.bits / (bus.bitrate * seconds))
-        for bus, count in zip(plan.can.buses, counts, strict=True)
-    )
-    fit = plan_fit(plan)
-    return CanReport(
-        path=plan.can.path,
-        timing=plan.can.timing if plan.can.closed else None,
-        url="",
-        listen="",
-        torque_scale=plan.can.torque_scale,
-        log_start=-start_ns / 1e9,
-        frames=frames,
-        load_mean=max(bus.load for bus in buses),
-        fit=tuple(bus.lines[0] for bus in fit),
-        advice=tuple(way for bus in fit for way in bus.advice),
-        buses=buses,
-        scheduled=scheduled(plan),
-        sent=None,
-        failed=None,
-        dropped=None,
-        log_lost=None,
-        log_error=None,
-        robots={},
-        referee=judged(log, plan, Terms.of(plan, clock, whole=False)) if frames else None,
-    )

@@ -30,8 +30,8 @@ from echelon.role import Role
 from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.session import Session
 from echelon.runtime.wire import encode, join, watch_key
-from echelon.sim.processes.contract import Body, ProcessSpec, finish, hear_finish, meet, tell
-from echelon.sim.processes.to_supervisor import Failed, PartFailed, Said, Waiting
+from echelon.sim.processes.contract import Body, ProcessSpec, StartError, failed, finish, hear_finish, meet, tell
+from echelon.sim.processes.to_supervisor import Said, Waiting
 from echelon.sim.processes.wall_bus_processes import made, run_wall_bridge, run_wall_drives, run_wall_referee
 from echelon.sim.processes.watch import STOP, Watch
 from echelon.sim.processes.watchers import HIGH_WATER, Reception
@@ -72,9 +72,22 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
         bridge.clock = RunClock(start_ns)
 
     def take(messages: list[Message]) -> None:
-        frames = [encode(message) for message in bridge.take(messages)]
+        try:
+            frames = [encode(message) for message in bridge.take(messages)]
+        except PartRunError as error:
+            end(error)
+            return
         for at in range(0, len(frames), BATCH):
             publisher.put(join(frames[at : at + BATCH]))
+
+    def end(why: PartRunError | None = None) -> None:
+        """Stops the wheels.  From here on the bridge makes no frames, but robots must not wait for it."""
+        try:
+            stop()
+        except PartRunError as error:
+            why = why or error
+        if why is not None:
+            control.send(failed(why))
 
     said_s = time.monotonic()
     order = None
@@ -83,7 +96,7 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
             watch.pulse.at_work(PROGRESS_S)
             take(reception.take(PROGRESS_S / 2))
             if watch.asked:
-                stop()  # from here on the bridge makes no frames, but robots must not wait for it
+                end()
             now_s = time.monotonic()
             if now_s - said_s >= PROGRESS_S:
                 said_s = now_s
@@ -92,6 +105,7 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
             order = hear_finish(control)
         for messages in reception.drain(order.robot_messages):
             take(messages)
+        end()
     finally:
         try:
             stop()
@@ -137,27 +151,26 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch
     done = threading.Event()
     teller = threading.Thread(target=_tell, args=(station, say_if_room, done), name="progress", daemon=True)
     teller.start()
-    failure: Failed | PartFailed | None = None
+    failure: StartError | PartRunError | None = None
     try:
         runner.run(lambda time_ns, sources: say_if_room(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off, but the counts so far are still reported
         pass
     except BusError as error:
-        failure = Failed(str(error))
+        failure = StartError(str(error))
     except PartRunError as error:
-        failure = PartFailed(str(error))
+        failure = error
     finally:
         try:
             stop()  # before anything that may wait for others
         except PartRunError as error:
-            failure = failure or PartFailed(str(error))
+            failure = failure or error
         runner.finish()
         done.set()
         teller.join()
         station.close()
     if failure is not None:
-        say(failure)
-        raise SystemExit(1)
+        say(failed(failure))
     # Who is ordered to stop the wheels is ordered to end soon after: its report comes first.
     finish(spec, control, runner.counts, runner.mailbox.counts(), station.report(), runner.refusals, leaves=True)
 

@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
+from echelon.errors import PartRunError
 from echelon.plan.plan import Plan
 from echelon.runtime.admission import Refusals
 from echelon.runtime.credentials import Credentials
@@ -28,7 +29,7 @@ from echelon.runtime.session import Session
 from echelon.runtime.wire import SCHEMA_VERSION, token_key, watch_key
 from echelon.sim.observing import Gate
 from echelon.sim.processes.to_process import Finish, Start
-from echelon.sim.processes.to_supervisor import Done, Ready, Report, Said
+from echelon.sim.processes.to_supervisor import Done, Failed, PartFailed, Ready, Report, Said
 from echelon.sim.processes.watch import STOP, Watch
 
 FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
@@ -87,6 +88,11 @@ Body = Callable[[ProcessSpec, Session, Connection, Watch], None]
 
 class StartError(Exception):
     """This process cannot start; the text says why, for the user."""
+
+
+def failed(error: StartError | PartRunError) -> Failed | PartFailed:
+    """Returns what the supervisor is told of a failure that is not this program's."""
+    return Failed(str(error)) if isinstance(error, StartError) else PartFailed(str(error))
 
 
 def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:

@@ -29,7 +29,7 @@ def stop_wheels(children: Sequence[Child], serve: Serve) -> None:
     """Has the bridge take the torque away from all wheels and disable their drives, before anything else ends."""
     bridges = [child for child in children if child.spec.kind == "bridge" and child.ready]
     for child in bridges:
-        child.stop()
+        _order(child)
     deadline_s = time.monotonic() + ZERO_S
     while time.monotonic() < deadline_s and any(
         child.alive and child.done is None and not child.pulse.has_stopped for child in bridges
@@ -43,11 +43,12 @@ def stop_wheels(children: Sequence[Child], serve: Serve) -> None:
 def stop_members(children: Sequence[Child], serve: Serve) -> None:
     """Ends the members of a run that breaks off.
 
-    They are ordered to end, so that they can send their last batches; those that do not end within `GRACE_S` are killed."""
+    They are ordered to end, so that they can send their last batches; those that do not end within `GRACE_S` are killed.  One
+    that somebody has stopped goes on once more, to do so."""
     members = [child for child in children if child.is_member]
     for child in members:
         if child.done is None:
-            child.stop()
+            _order(child)
     deadline_s = time.monotonic() + GRACE_S
     # Bridge and drives report their counts before they end, so their pipes must be read meanwhile.
     while time.monotonic() < deadline_s and any(child.alive and child.done is None for child in members):
@@ -58,6 +59,13 @@ def stop_members(children: Sequence[Child], serve: Serve) -> None:
     for child in members:
         if child.done is None:
             child.signal(signal.SIGKILL)
+
+
+def _order(child: Child) -> None:
+    """Orders a process to end; one that somebody has stopped can do so, since it goes on."""
+    child.stop()
+    if child.state() == "stopped":
+        child.signal(signal.SIGCONT)
 
 
 def finish_watchers(
@@ -117,20 +125,23 @@ def _finish(
     after `GRACE_S`, and then the run has failed.  What has not finished `GRACE_S` later is given up."""
     try:
         child.control.send(order)
-        begun_s, continued = time.monotonic(), False
-        while child.done is None and child.alive:
+    except OSError as error:
+        return failure or str(error)
+    begun_s, continued = time.monotonic(), False
+    while child.done is None and child.alive:
+        try:
             serve(0.05)
-            waited_s, stopped = time.monotonic() - begun_s, child.state() == "stopped"
-            if not failure and waited_s > STALL_REPORT_S:
-                say(f"waits for {child.name} to finish ({child.state()}{child.runs()})")
-            if stopped and not continued and (failure or waited_s > GRACE_S):
-                failure = failure or _lost(child)
-                child.signal(signal.SIGCONT)
-                begun_s, continued = time.monotonic(), True
-            elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
-                break
-    except (RunError, DivergedError, OSError) as error:
-        failure = failure or str(error)
+        except (RunError, DivergedError) as error:  # its report may follow
+            failure = failure or str(error)
+        waited_s, stopped = time.monotonic() - begun_s, child.state() == "stopped"
+        if not failure and waited_s > STALL_REPORT_S:
+            say(f"waits for {child.name} to finish ({child.state()}{child.runs()})")
+        if stopped and not continued and (failure or waited_s > GRACE_S):
+            failure = failure or _lost(child)
+            child.signal(signal.SIGCONT)
+            begun_s, continued = time.monotonic(), True
+        elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
+            break
     return failure or (_lost(child) if child.done is None else None)
 
 

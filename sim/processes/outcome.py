@@ -1,13 +1,17 @@
 """What the supervisor of a run tells others: its progress while it goes on, and its outcome at the end."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TypeVar
 
 from echelon.bridge.referee_reports import RefereeReport
 from echelon.bridge.reports import BridgeProgress, CanReport, DrivesReport
+from echelon.errors import UserError
 from echelon.plan.plan import Plan
 from echelon.runtime.link import LinkCounts
+from echelon.sim.log_report import report_of_log
 from echelon.sim.processes.to_supervisor import Done, RecorderProgress, RecorderReport
 from echelon.sim.results.records import RefusalResult
 from echelon.sim.results.trace import Array, Trace, TraceBuilder
@@ -86,12 +90,19 @@ class Outcome:
         return tuple(sorted(found, key=lambda each: -each.messages))
 
 
-def outcome_of(plan: Plan, processes: list[Done], failure: str | None, startup_s: float, wall_s: float) -> Outcome:
-    """Returns the outcome of a run from the reports of its processes.
+def outcome_of(
+    plan: Plan, processes: list[Done], failure: str | None, startup_s: float, wall_s: float, log: Path | None
+) -> Outcome:
+    """Returns the outcome of a run from the reports of its processes; `log` is its can.log, if it has buses.
 
-    A run whose recorder gave no report has an empty trace."""
+    A run whose recorder gave no report has an empty trace.  If its bridge gave none, the report on the buses is what can.log
+    shows."""
     recorder = _report(RecorderReport, processes)
     can, drives = _report(CanReport, processes), _report(DrivesReport, processes)
+    if can is None and log is not None:
+        with suppress(OSError, UserError):  # a run that failed early has no log
+            found = report_of_log(plan, log)
+            can = found if found.frames else None
     if can is not None:
         can = replace(can if drives is None else can.with_drives(drives), referee=_report(RefereeReport, processes))
     return Outcome(

@@ -28,9 +28,9 @@ from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.paced import PacedRunner
 from echelon.runtime.session import Session
 from echelon.sim.engines.in_process import make_role
-from echelon.sim.processes.contract import Body, ProcessSpec, StartError, finish, meet
+from echelon.sim.processes.contract import Body, ProcessSpec, StartError, failed, finish, meet
 from echelon.sim.processes.pulse import Pulse
-from echelon.sim.processes.to_supervisor import Failed, LinksProgress, PartFailed, Said, Waiting
+from echelon.sim.processes.to_supervisor import LinksProgress, Said, Waiting
 from echelon.sim.processes.watch import STOP, Watch, leave
 
 COMPILED: Final = "echelon.sim.batch.torque_loop"
@@ -76,11 +76,8 @@ def main(spec: ProcessSpec, control: Connection, words: Connection, pulses: Any,
             body(spec, session, control, watch)
     except SystemExit:
         os._exit(0)
-    except StartError as error:
-        control.send(Failed(str(error)))
-        os._exit(1)
-    except PartRunError as error:
-        control.send(PartFailed(str(error)))
+    except (StartError, PartRunError) as error:
+        control.send(failed(error))
         os._exit(1)
     except BaseException:
         traceback.print_exc()

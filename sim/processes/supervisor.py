@@ -26,6 +26,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
+from echelon.bridge.stations.closed import LOG
 from echelon.plan.plan import Plan
 from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.sim.interruption import Interruption, Raises, interruption
@@ -90,6 +91,7 @@ class Supervisor:
     ) -> None:
         self.plan, self.virtual = plan, virtual
         self._folder, self._notes_arrivals = folder, recorded and not virtual
+        self._log = folder / LOG if can_urls else None
         self.progress = Progress()
         self._show = show
         told = scenario_toml, metadata or {}, part_files or {}
@@ -164,7 +166,7 @@ class Supervisor:
         if error is not None:
             raise error
         processes = [child.done for child in self._children if child.done is not None]
-        outcome = outcome_of(self.plan, processes, failure, self._startup_s, wall_s)
+        outcome = outcome_of(self.plan, processes, failure, self._startup_s, wall_s, self._log)
         outcome.standstills = standstills
         outcome.refused_here = self._hearing.refusals.by_source()
         common_ns = outcome.trace.common_ns()

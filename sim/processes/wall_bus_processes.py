@@ -13,10 +13,11 @@ from echelon.bridge.referee.referee import Referee
 from echelon.bridge.stations.waiting import PROGRESS_NS, Mail, RunClock, drained, wait_for
 from echelon.bridge.stations.wall_bridge import WallBridge
 from echelon.bridge.stations.wall_drives import WallDrives
+from echelon.errors import PartRunError
 from echelon.messages import Channel
 from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, watch_key
-from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet, tell
+from echelon.sim.processes.contract import ProcessSpec, StartError, failed, finish, hear_finish, meet, tell
 from echelon.sim.processes.watch import STOP, Watch
 
 LISTEN_NS: Final = 10_000_000
@@ -33,7 +34,8 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection, wa
     """Runs the bridge on the closed path on a wall clock.
 
     When the run is over and nobody orders it to finish, since the supervisor stands still, it stops the wheels by itself.
-    Raises StartError if drives are in fault when the run begins."""
+    It also stops them, and tells the supervisor why, if drives are in fault when the run begins, or if a user's protocol
+    fails."""
     plan = spec.plan
     assert plan.bridge is not None
     bridge_key = data_key(spec.run, plan.bridge.path, Channel.WHEELS)
@@ -49,9 +51,10 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection, wa
     signal.signal(STOP, lambda number, frame: None)  # the watch hears of it
     until_ns = plan.duration_ns + ALONE_NS
     said_ns = -1 << 62
-    begun = False
-    try:
-        order = None
+    begun, order = False, None
+
+    def serve() -> None:
+        nonlocal begun, order, said_ns
         while not watch.asked and order is None and clock.now() < until_ns:
             left_ns = min(max(bridge.due_ns - clock.now(), 0), PROGRESS_NS)
             now_ns = time.monotonic_ns()
@@ -67,7 +70,16 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection, wa
                 said_ns = now_ns
                 tell(control, bridge.progress())
             order = hear_finish(control)
-        stop()
+
+    failure: StartError | PartRunError | None = None
+    try:
+        for step in serve, stop:
+            try:
+                step()
+            except (StartError, PartRunError) as error:
+                failure = failure or error
+        if failure is not None:
+            control.send(failed(failure))
         watch.pulse.rest()
         while order is None:
             wait_for([control], PROGRESS_NS)

@@ -121,6 +121,17 @@ def test_what_fails_in_a_run_is_one_line_and_wheels_are_stopped_first(
     frames = [frame for _, _, frame in frames_in(tmp_path / "run" / "can.log")]
     assert [(frame.can_id, frame.data) for frame in frames[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
     assert any(says in reason for reason in reasons(summary_of(tmp_path / "run")))
+    the_bridge_has_reported(tmp_path / "run")
+
+
+def the_bridge_has_reported(folder: Path) -> None:
+    """Checks that a summary has the counts of the bridge, not only what can.log shows."""
+    can = summary_of(folder)["can"]
+    assert len(can["robots"]) == 3
+    assert can["wheels_stopped"] is not None
+    assert can["sent"] is not None
+    stops = 0 if can["path"] == "closed" else 1  # of the one mirrored robot that had torque
+    assert can["frames"] + stops == len(list(frames_in(folder / "can.log")))
 
 
 @pytest.mark.slow
@@ -133,6 +144,21 @@ def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Pa
     assert "its host's command raised KeyError: 'w'" in done.stderr
     commands = [frame for _, _, frame in frames_in(tmp_path / "run" / "can.log") if frame.can_id < 0x380]
     assert [(frame.can_id, frame.data) for frame in commands[-3:]] == [(0x300 + robot, bytes(5)) for robot in range(3)]
+    the_bridge_has_reported(tmp_path / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", ["virtual", "wall"])
+def test_a_mirroring_bridge_reports_a_failure_and_its_counts(folder: Path, tmp_path: Path, clock: str) -> None:
+    old, new = failing("mirror", "raise KeyError('w')")
+    new = new.replace("arguments[0] > 300_000_000", "arguments[0] > 0.0")  # a torque, not a time
+    scenario = changed(folder, (old, new))
+    sets = ("--set", "can.path=mirror", "--set", "claims=[]", "--can", "virtual", "--clock", clock)
+    done = echelon("run", scenario, *sets, *QUIET, "--out", tmp_path / "run")
+    assert done.returncode == 3
+    (line,) = done.stderr.splitlines()
+    assert "its host's mirror raised KeyError: 'w'" in line
+    the_bridge_has_reported(tmp_path / "run")
 
 
 def test_a_host_that_cannot_even_stop_is_made_to_ask_for_no_torque(folder: Path) -> None:

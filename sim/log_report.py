@@ -1,0 +1,57 @@
+"""The report on the buses of a run whose bridge gave none, since it was killed or failed: from can.log."""
+
+import os
+from pathlib import Path
+
+from echelon.bridge.referee.log import read_run_log
+from echelon.bridge.reports import BusReport, CanReport
+from echelon.bridge.timing.bus_load import BitCount
+from echelon.bridge.timing.buses import scheduled
+from echelon.bridge.timing.fit import plan_fit
+from echelon.plan.plan import Plan
+
+
+def report_of_log(plan: Plan, log: Path) -> CanReport:
+    """Returns the report on the buses, as far as can.log shows it; counts that it does not show are None.
+
+    An unfinished last line is removed from the log.  Raises OSError, and UserError for a log that is not the plan's."""
+    drop_cut_line(log)
+    counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, 0
+    for time_ns, bus, (can_id, data, remote) in read_run_log(log, plan):
+        counts[bus].add(can_id, data, remote)
+        frames, last_ns = frames + 1, max(last_ns, time_ns)
+    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
+    seconds = max(last_ns + start_ns, 1) / 1e9
+    buses = tuple(
+        BusReport(bus.name, bus.bitrate, count.bits / (bus.bitrate * seconds))
+        for bus, count in zip(plan.can.buses, counts, strict=True)
+    )
+    fit = plan_fit(plan)
+    return CanReport(
+        path=plan.can.path,
+        timing=plan.can.timing if plan.can.closed else None,
+        url="",
+        listen="",
+        torque_scale=plan.can.torque_scale,
+        log_start=-start_ns / 1e9,
+        frames=frames,
+        load_mean=max(bus.load for bus in buses),
+        fit=tuple(bus.lines[0] for bus in fit),
+        advice=tuple(way for bus in fit for way in bus.advice),
+        buses=buses,
+        scheduled=scheduled(plan),
+        sent=None,
+        failed=None,
+        dropped=None,
+        log_lost=None,
+        log_error=None,
+        robots={},
+    )
+
+
+def drop_cut_line(log: Path) -> None:
+    """Removes an unfinished last line: half a frame may look like a frame with less data."""
+    content = log.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        os.truncate(log, whole)

@@ -54,6 +54,10 @@ class _Axis:
     fault_ns: int = 0
     pushed_ns: int | None = None
     """Since when its commanded torques are not zero; None: they are"""
+    gives: bool = False
+    """It has reported torque since torque is commanded"""
+    zero_ns: int | None = None
+    """Since when it has reported nothing but zero torque though torque is commanded; None: it has not"""
     heard_ns: int | None = None
     prepared_ns: int | None = None
     """When its mode was sent, if Set_Axis_State has yet to follow"""
@@ -171,7 +175,7 @@ class ODriveHost:
             if abs(torque) <= ZERO_TORQUE:
                 axis.pushed_ns = None
             elif axis.pushed_ns is None:
-                axis.pushed_ns = time_ns
+                axis.pushed_ns, axis.gives, axis.zero_ns = time_ns, False, None
             frames.append(Frame(can_id, _TORQUE.encode(torque)))
         return frames
 
@@ -210,11 +214,7 @@ class ODriveHost:
         axis.heard_ns = time_ns
         if command is Command.GET_TORQUES:
             axis.torque, axis.torque_ns = values[1], time_ns
-            # A disarmed axis reports exactly zero, which shows before its next heartbeat.  Three periods allow for commands
-            # that are delayed or lost.
-            pushed = axis.pushed_ns is not None and time_ns - axis.pushed_ns >= 3 * self.plan.period_ns
-            if axis.closed and pushed and values == (0.0, 0.0):
-                axis.fail(time_ns, NO_TORQUE)
+            self._zero_torque(axis, time_ns, values == (0.0, 0.0))
         elif command is Command.HEARTBEAT:
             self._heartbeat(axis, time_ns, values[0], values[1])
         elif command is Command.GET_ERROR and values[0]:
@@ -243,6 +243,22 @@ class ODriveHost:
             axis.forget()  # the bring-up began before the error was known, without `Clear_Errors`: begin anew
         axis.errors = errors
         axis.fail(time_ns, error_names(errors))
+
+    def _zero_torque(self, axis: _Axis, time_ns: int, zero: bool) -> None:
+        """Finds a disarmed axis, which reports exactly zero torque: that shows before its next heartbeat.
+
+        Three periods allow for commands that are delayed or lost.  Where no torque has come yet, reports over two of them
+        allow for a host or a drive that stood still: it then reads, or sends, all reports from before the command at once."""
+        if axis.pushed_ns is None or not axis.closed:
+            return
+        if not zero:
+            axis.gives = True
+            return
+        if axis.zero_ns is None:
+            axis.zero_ns = time_ns
+        period_ns = self.plan.period_ns
+        if time_ns - axis.pushed_ns >= 3 * period_ns and (axis.gives or time_ns - axis.zero_ns >= 2 * period_ns):
+            axis.fail(time_ns, NO_TORQUE)
 
     def _heartbeat(self, axis: _Axis, time_ns: int, errors: int, state: int) -> None:
         axis.state = state

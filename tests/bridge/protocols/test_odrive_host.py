@@ -268,9 +268,27 @@ def test_an_axis_that_gives_no_torque(cycles: int, report: Frame, fault: str) ->
         host.receive(0, frame(axis, "Heartbeat", Axis_State="CLOSED_LOOP_CONTROL"))
     for cycle in range(cycles):
         host.command(cycle * PERIOD_NS, 0.5, 0.0)
-    host.receive(cycles * PERIOD_NS, report)
-    host.receive(cycles * PERIOD_NS, report._replace(can_id=0x5C))  # none was commanded there
+        host.receive((cycle + 1) * PERIOD_NS, report)
+        host.receive((cycle + 1) * PERIOD_NS, report._replace(can_id=0x5C))  # none was commanded there
     assert (host.fault, host.enabled) == (fault, not fault)
+
+
+@pytest.mark.parametrize("gives", [True, False])
+def test_reports_that_come_all_at_once_after_a_standstill_are_no_fault(gives: bool) -> None:
+    """Host or drive stood still: the reports are from before the command.  Later ones tell whether the axis gives torque."""
+    robot = Robot().up()
+    host = robot.host
+    robot.cycle(0.0, 0.0)
+    for cycle in range(10):
+        host.command(robot.now_ns + cycle * PERIOD_NS, 0.5, 0.0)
+    at_ns = robot.now_ns + 10 * PERIOD_NS
+    for late_ns in range(9):
+        host.receive(at_ns + 10_000 * late_ns, NOTHING)
+    assert host.fault == ""
+    for cycle in range(1, 3):
+        report = frame(1, "Get_Torques", Torque_Target=0.5, Torque_Estimate=0.5) if gives else NOTHING
+        host.receive(at_ns + cycle * PERIOD_NS, report)
+        assert host.fault == ("" if gives or cycle == 1 else "right: gives no torque")
 
 
 def test_the_other_wheel_stops_with_the_next_command() -> None:

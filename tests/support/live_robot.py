@@ -51,6 +51,11 @@ class LiveRobot:
         """Set when torques are commanded"""
         self._thread = threading.Thread(target=self._serve, name="host", daemon=True)
 
+    @property
+    def fault(self) -> str:
+        """The present faults of the drives, as the host has them."""
+        return self._host.fault
+
     def __enter__(self) -> Self:
         self._bench.__enter__()
         self._thread.start()

@@ -28,6 +28,7 @@ def test_nothing_is_found_where_all_keep_the_contract(
         assert (code, summary["findings"]) == (0, [])
         assert main(["can", str(path), "--can", URL, "--seconds", "2.5", "--json"]) == 0
         shot = json.loads(capsys.readouterr().out.splitlines()[-1])
+        assert robot.fault == ""
     assert (summary["kinds"], summary["unknown"]) == ({}, 0)
     assert summary["frames"] > 50
     assert [wheel["commanded"] for wheel in shot["robots"][0]["wheels"]] == pytest.approx(TORQUES, abs=0.002)

@@ -57,7 +57,7 @@ class RefereeReport:
     until: float | None = None
     """When the run was stopped, if it was [s]: only frames up to then are judged; None: all frames are"""
     later: int = 0
-    """Frames in can.log after `until`, which are not judged: the processes of a run end one after the other"""
+    """Frames after `until`, which are not judged: the processes of a run end one after the other"""
     left_out: Mapping[str, int] = field(default_factory=dict)
     """What of the log is not judged, by reason: for example frames of interfaces that are not buses of the scenario"""
 
@@ -71,7 +71,5 @@ class RefereeReport:
         """A sentence about the frames after the stop, without a capital or a full stop; empty if there are none."""
         if self.until is None or not self.later:
             return ""
-        return (
-            f"the run was stopped at {self.until:g} s; can.log and the numbers of the buses include {self.later} later frames, "
-            "which are not judged"
-        )
+        where = "on the bus there were" if self.source == "bus" else "can.log and the numbers of the buses include"
+        return f"the run was stopped at {self.until:g} s; {where} {self.later} later frames, which are not judged"

@@ -126,8 +126,8 @@ def execute(
         outcome = supervisor.run()
     can = outcome.can
     whole = not (outcome.failure or outcome.stopped)
-    # a referee that listens does not know when a run breaks off
-    if can is not None and (can.referee is None or not whole):
+    # of a run that diverged some robots' frames end before the others'
+    if can is not None and (can.referee is None or outcome.stopped):
         try:
             terms = Terms.of(plan, clock, whole, until_ns(plan, outcome))
             can = replace(can, referee=judged(folder / LOG, plan, terms))

@@ -83,7 +83,7 @@ class RunClock:
 
     def __init__(self, start_ns: int | None = None) -> None:
         self._start_ns = time.monotonic_ns() if start_ns is None else start_ns
-        self._epoch_ns = time.time_ns() - time.monotonic_ns() + self._start_ns
+        self._epoch_ns = _epoch_of_monotonic_clock() + self._start_ns
 
     def now(self) -> int:
         """Returns the present run time."""
@@ -92,6 +92,18 @@ class RunClock:
     def of(self, time_ns: int) -> int:
         """Returns the run time of a time stamp of the kernel [ns since 1970]."""
         return time_ns - self._epoch_ns
+
+
+def _epoch_of_monotonic_clock() -> int:
+    """Returns when the monotonic clock was 0 [ns since 1970].
+
+    The two clocks are read one after the other, and this process may lose its processor in between: the shortest of some tries
+    counts."""
+    tries = []
+    for _ in range(5):
+        before_ns, now_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        tries.append((after_ns - before_ns, now_ns - (before_ns + after_ns) // 2))
+    return min(tries)[1]
 
 
 def wait_for(sources: Sequence[Any], left_ns: int) -> None:

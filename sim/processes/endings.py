@@ -4,6 +4,7 @@
 import signal
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Final
 
 from echelon.bridge.reports import CanReport
@@ -11,7 +12,7 @@ from echelon.sim.processes.children import Child, last_words_of
 from echelon.sim.processes.contract import FINISHING
 from echelon.sim.processes.failures import DivergedError, RunError, few
 from echelon.sim.processes.stalls import STALL_REPORT_S
-from echelon.sim.processes.to_process import End, Finish
+from echelon.sim.processes.to_process import BreakOff, End, Finish
 from echelon.sim.processes.to_supervisor import RecorderReport
 
 ZERO_S: Final = 0.5
@@ -26,7 +27,13 @@ Serve = Callable[[float], None]
 
 
 def stop_wheels(children: Sequence[Child], serve: Serve) -> None:
-    """Has the bridge take the torque away from all wheels and disable their drives, before anything else ends."""
+    """Has the bridge take the torque away from all wheels and disable their drives, before anything else ends.
+
+    The referee hears of it first, so that it does not judge the frames of this stop."""
+    for child in children:
+        if child.spec.kind == "referee" and child.ready and child.alive:
+            with suppress(OSError):
+                child.control.send(BreakOff())
     bridges = [child for child in children if child.spec.kind == "bridge" and child.ready]
     for child in bridges:
         _order(child)
@@ -82,6 +89,7 @@ def finish_watchers(
     lost, and watchers wait until it is silent.  `say` shows a note to the user.  Once the user has `asked` for the end, each
     watcher has `GRACE_S`."""
     links = tuple(counts for child in children if child.done for counts in child.done.links)
+    stopped_ns: int | None = None
     sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
     for child in children:
         if child.done and child.done.runner:
@@ -95,10 +103,13 @@ def finish_watchers(
                 links=links,
                 robot_messages=sent["robot"] if told else None,
                 messages=sum(sent.values()) if told else None,
+                wheels_stopped_ns=stopped_ns,
             )
             failure = _finish(child, order, serve, say, failure, asked)
             if child.done is not None and isinstance(child.done.report, CanReport):
                 sent["bridge"] = child.done.report.messages
+                stop_s = child.done.report.wheels_stopped
+                stopped_ns = None if stop_s is None else round(stop_s * 1e9)
     for child in children:
         report = child.done and child.done.report
         if isinstance(report, RecorderReport) and report.failure:

@@ -144,16 +144,15 @@ class Supervisor:
         begun_s = self.progress.started_s
         wall_s = max(0.0, time.monotonic() - begun_s) if begun_s else 0.0
         try:
+            standstills = self._standstills()
             if broken:
                 stop_wheels(self._children, self._hearing.serve)
                 if failure is not None:
                     failure = self._signalled() or failure
                     self.progress.note = failure.splitlines()[0]
-                standstills = self._standstills()
                 stop_members(self._children, self._hearing.serve)
             else:
                 self.progress.phase = "finishing"
-                standstills = self._standstills()
             whole = self.virtual and not broken  # on a wall clock, messages may be lost on the way
             failure = finish_watchers(
                 self._children, self._hearing.serve, self._say, failure, whole, lambda: self._interruption.asked

@@ -13,6 +13,11 @@ class Start:
 
 
 @dataclass(frozen=True, slots=True)
+class BreakOff:
+    """To the referee: the run breaks off, and the bridge is about to stop the wheels."""
+
+
+@dataclass(frozen=True, slots=True)
 class Finish:
     """To watchers: the run is over.  The numbers of messages are None if messages may be lost."""
 
@@ -22,6 +27,8 @@ class Finish:
     """Number of messages that the robots sent"""
     messages: int | None
     """Number of messages that all members and the bridge sent"""
+    wheels_stopped_ns: int | None = None
+    """When the bridge stopped the wheels [ns of run time]; None if it has not said"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,5 +36,5 @@ class End:
     """All processes are done: close."""
 
 
-Told = Start | Finish | End
+Told = Start | BreakOff | Finish | End
 """Any order to a process."""

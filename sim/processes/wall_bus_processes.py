@@ -9,6 +9,7 @@ from typing import Final, TypeVar
 
 from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.protocols.frame import Frame
+from echelon.bridge.referee.patient import PatientReferee
 from echelon.bridge.referee.referee import Referee
 from echelon.bridge.stations.waiting import PROGRESS_NS, Mail, RunClock, drained, wait_for
 from echelon.bridge.stations.wall_bridge import WallBridge
@@ -18,6 +19,7 @@ from echelon.messages import Channel
 from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, watch_key
 from echelon.sim.processes.contract import ProcessSpec, StartError, failed, finish, hear_finish, meet, tell
+from echelon.sim.processes.to_process import BreakOff, Finish, Told
 from echelon.sim.processes.watch import STOP, Watch
 
 LISTEN_NS: Final = 10_000_000
@@ -60,9 +62,9 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection, wa
             now_ns = time.monotonic_ns()
             watch.pulse.beat(now_ns, now_ns + left_ns)
             wait_for([control, watch, *bridge.sources], left_ns)
-            bridge.serve()
             now_ns = clock.now()
-            if not begun and now_ns >= plan.can.watchdog_ns:
+            bridge.serve()
+            if not begun and now_ns >= plan.can.watchdog_ns:  # what drives have reported until then has been read
                 begun = True
                 if faults := bridge.faults_of_start():
                     raise StartError(f"{faults}: drives must be free of faults when a run begins; {BUSY}")
@@ -136,24 +138,30 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection, w
     """Runs the referee on a wall clock: it listens to the buses only."""
     buses = _open_buses(spec.can_urls)
     # processes wait for a processor, so a frame is late only by a time that a drive's watchdog would almost notice
-    referee = Referee(spec.plan, tolerance_ns=spec.plan.can.watchdog_ns // 2)
+    tolerance_ns = spec.plan.can.watchdog_ns // 2
+    referee = PatientReferee(Referee(spec.plan, tolerance_ns=tolerance_ns), spec.plan.duration_ns)
     watch.pulse.from_ns = meet(spec, session, control)
     clock = RunClock(watch.pulse.from_ns)
-    while hear_finish(control) is None:
+    order: Told | None = None
+    while not isinstance(order, Finish):
         watch.pulse.at_work(PROGRESS_NS / 1e9)
         wait_for([control], LISTEN_NS)  # not for each frame: the kernel stamps them
-        for number, bus in enumerate(buses):
-            for received in drained(bus):
-                at_ns = clock.of(received.time_ns)
-                if at_ns <= spec.plan.duration_ns:  # after the end of a run, bridge and drives stop one after the other
-                    referee.observe(at_ns, number, Frame(received.can_id, received.data, received.remote))
+        order = control.recv() if control.poll() else None
+        if isinstance(order, BreakOff):
+            referee.hold()
+        frames = [
+            (clock.of(received.time_ns), number, Frame(received.can_id, received.data, received.remote))
+            for number, bus in enumerate(buses)
+            for received in drained(bus)
+        ]
+        referee.hear(clock.now(), frames)
     watch.pulse.rest()
-    referee.finish(min(clock.now(), spec.plan.duration_ns))
+    report = referee.finish(clock.now(), order.wheels_stopped_ns)
     # robots must not be blamed for what the referee did not hear: then can.log is judged instead
     deaf = any(bus.missed for bus in buses)
     for bus in buses:
         bus.close()
-    finish(spec, control, report=None if deaf else referee.report("bus"))
+    finish(spec, control, report=None if deaf else report)
 
 
 def _hear_torques(spec: ProcessSpec, session: Session, mail: Mail) -> None:

@@ -305,9 +305,8 @@ def test_export_overwrites_tables_only_where_it_is_told_to(folder: Path, tmp_pat
 
 def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "both.html"
-    assert echelon("report", folder, folder, "--out", page).returncode == 0
-    assert page.stat().st_size > 10_000
     done = echelon("report", folder, folder, "--out", page, "--json")
+    assert page.stat().st_size > 10_000
     assert json.loads(done.stdout) == {"report": str(page), "figures": [], "runs": [str(folder), str(folder)]}
 
 

@@ -223,7 +223,6 @@ def steady(name: str, *overrides: str) -> dict[str, Array]:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_what_the_controller_does_not_know_vanishes_in_runs():
     """The shipped scenario has a slope, rolling resistance and loads.  With the linear law the centroid's error is that of the
     balance of forces."""

@@ -645,6 +645,7 @@ def test_any_text_is_a_scenario_or_explained(text):
     assert not check(text)
 
 
+@pytest.mark.slow
 @settings(fuzz, max_examples=500)
 @given(st.sampled_from(sorted(TEXTS_OF)), st.data())
 def test_a_damaged_file_loads_or_is_explained(name, data):

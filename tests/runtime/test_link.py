@@ -60,6 +60,7 @@ def test_draws_are_philox_4x64_at_the_messages_counter():
     assert np.array_equal(np.concatenate([draws(key, block) for block in range(3)]).ravel(), words * 2.0**-53)
 
 
+@pytest.mark.slow
 @given(plans, seeds, st.permutations(range(0, 1300, 13)))
 def test_a_fate_does_not_depend_on_earlier_calls(plan, seed, numbers):
     in_order = made(plan, seed)

@@ -104,6 +104,7 @@ def test_random_bytes_are_a_message_or_refused(payload):
     assert encode(message) == payload
 
 
+@pytest.mark.slow
 @settings(max_examples=1000)
 @given(messages, st.data())
 def test_a_flipped_byte_of_the_header_never_passes_unseen(message, data):

@@ -81,6 +81,7 @@ def test_python_can_reads_it(tmp_path: Path) -> None:
     assert messages[299].timestamp == pytest.approx(1_700_000_002.99, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_cantools_decodes_it(tmp_path: Path) -> None:
     path, dbc = tmp_path / "can.log", tmp_path / "torque.dbc"
     write_some(path)

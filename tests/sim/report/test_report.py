@@ -118,6 +118,7 @@ def test_the_page_needs_nothing_but_itself(single):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_ids_are_unique_or_repeat_the_same_thing(both):
     ids = {value for _, key, value in both.attributes if key == "id"}
     used = {value[1:] for _, key, value in both.attributes if key.endswith("href")}
@@ -125,6 +126,7 @@ def test_ids_are_unique_or_repeat_the_same_thing(both):
     assert used == ids
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_every_figure_has_words_for_those_who_do_not_see_it(single, both):
     for page, figures in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):
@@ -204,6 +206,7 @@ def test_the_effective_scenario_stands_at_the_end(run, single):
     assert single.text.endswith(scenario)
 
 
+@pytest.mark.slow
 def test_a_comparison_shows_the_papers_figures_with_the_runs_they_belong_to(both):
     text = both.text
     without, avoiding = (
@@ -216,6 +219,7 @@ def test_a_comparison_shows_the_papers_figures_with_the_runs_they_belong_to(both
     assert both.text.count("Effective scenario") == 1
 
 
+@pytest.mark.slow
 def test_a_comparison_says_what_differs_and_takes_nothing_of_the_first_run_for_all(both):
     assert "9 robots · 4 nodes · 3 s, 1 s · trace" in both.text
     (rows,) = re.findall("What differs .* key left right (.*?) What was measured", both.text)
@@ -225,6 +229,7 @@ def test_a_comparison_says_what_differs_and_takes_nothing_of_the_first_run_for_a
     )
 
 
+@pytest.mark.slow
 def test_a_comparison_sets_what_was_measured_side_by_side(both):
     (rows,) = re.findall("What was measured .*? left right (.*?) Compared", both.text)
     for measure in ("verdict", "settling to 2 % of g1", "∫|e|² dt of centroid", "smallest distance of two robots"):
@@ -232,6 +237,7 @@ def test_a_comparison_sets_what_was_measured_side_by_side(both):
     assert "g2" in rows
 
 
+@pytest.mark.slow
 def test_figures_of_the_paper_are_named_under_the_papers_scenario_alone(run, single, tmp_path):
     assert "the paper's Fig. 2" in single.text
     assert "The paper's Fig. 4" in single.text

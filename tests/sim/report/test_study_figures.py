@@ -179,6 +179,7 @@ def test_captions_say_what_made_the_figure_and_files_have_them_beside(tmp_path) 
     assert again[0].read_bytes() == (tmp_path / "new" / again[0].name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_page_is_one_file_with_texts_under_the_pointer(tmp_path) -> None:
     predicted = Predicted((Boundary({}, 0.25),))
     results = study({DELAY: DELAYS}, lambda d: float(d < 0.25), predicted=predicted)

@@ -83,6 +83,8 @@ class WallBridge(Bridge):
         self.clock = RunClock()
         self.in_time = 0
         self._messages = 0
+        self.behind = False
+        """More frames have come than were read at once"""
         self._stopped = False
         """The wheels have been stopped, and nothing is sent any more"""
         self._tell_wheels, self._watch = tell_wheels, watch
@@ -151,8 +153,10 @@ class WallBridge(Bridge):
 
     def _frames_from_buses(self, now_ns: int) -> None:
         """Takes the frames that have come from the buses."""
+        self.behind = False
         for number, bus in enumerate(self._closed.buses):
-            for received in drained(bus):
+            count = 0
+            for count, received in enumerate(drained(bus), 1):  # noqa: B007  used after the loop
                 frame = Frame(received.can_id, received.data, received.remote)
                 check_sender(bus, self._buses[number].spoken, received)
                 came_ns = min(self.clock.of(received.time_ns), now_ns)  # by the kernel's time stamp
@@ -160,6 +164,7 @@ class WallBridge(Bridge):
                 if not self._role.buses[number].is_off(BRIDGE_NODE):
                     self._role.receive(now_ns, number, frame)
                 self._note(TimedFrame(came_ns, number, OTHER_NODE, frame))
+            self.behind |= count == AT_ONCE
 
     def _pass_time(self, now_ns: int) -> None:
         """Begins a new period if it is due; tells the robots the torques of their wheels in the period that ended."""

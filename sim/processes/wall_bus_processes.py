@@ -64,7 +64,9 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection, wa
             wait_for([control, watch, *bridge.sources], left_ns)
             now_ns = clock.now()
             bridge.serve()
-            if not begun and now_ns >= plan.can.watchdog_ns:  # what drives have reported until then has been read
+            if (
+                not begun and now_ns >= plan.can.watchdog_ns and not bridge.behind
+            ):  # drives' reports until then are read
                 begun = True
                 if faults := bridge.faults_of_start():
                     raise StartError(f"{faults}: drives must be free of faults when a run begins; {BUSY}")

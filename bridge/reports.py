@@ -222,7 +222,8 @@ class CanReport:
     scheduled: tuple[ScheduledEvent, ...]
     """Events of the scenario"""
     sent: int | None
-    """Frames that the buses accepted.  This and the next four fields are None if the run was killed and recovered."""
+    """Frames that the buses accepted.  This and the next four fields are None if the bridge gave no report, since it
+    was killed."""
     failed: int | None
     """Frames that a bus refused"""
     dropped: int | None
@@ -249,7 +250,7 @@ class CanReport:
     """Messages that the bridge sent to recorders and other listeners"""
     wheels_stopped: float | None = None
     """When the bridge stopped the wheels at the end of the run [s]: from then on can.log has the frames of this stop; None if
-    the run was killed and recovered"""
+    the bridge gave no report, since it was killed"""
 
     @property
     def stopped(self) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Final
 
 from echelon.bridge.referee.log import read_run_log
 from echelon.bridge.reports import BusReport, CanReport
@@ -10,17 +11,20 @@ from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
 from echelon.plan.plan import Plan
 
+LONGEST_LINE: Final = 4096
+"""No line of can.log is longer [bytes]"""
+
 
 def report_of_log(plan: Plan, log: Path) -> CanReport:
     """Returns the report on the buses, as far as can.log shows it; counts that it does not show are None.
 
-    An unfinished last line is removed from the log.  Raises OSError, and UserError for a log that is not the plan's."""
-    drop_cut_line(log)
-    counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, 0
+    An unfinished last line is removed from the log.  Raises OSError, and PartRunError if a user's own protocol fails."""
+    _drop_cut_line(log)
+    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
+    counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, -start_ns
     for time_ns, bus, (can_id, data, remote) in read_run_log(log, plan):
         counts[bus].add(can_id, data, remote)
         frames, last_ns = frames + 1, max(last_ns, time_ns)
-    start_ns = plan.can.bring_up_ns if plan.can.closed else 0
     seconds = max(last_ns + start_ns, 1) / 1e9
     buses = tuple(
         BusReport(bus.name, bus.bitrate, count.bits / (bus.bitrate * seconds))
@@ -49,9 +53,11 @@ def report_of_log(plan: Plan, log: Path) -> CanReport:
     )
 
 
-def drop_cut_line(log: Path) -> None:
+def _drop_cut_line(log: Path) -> None:
     """Removes an unfinished last line: half a frame may look like a frame with less data."""
-    content = log.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
+    with log.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        begin = file.seek(max(0, size - LONGEST_LINE))
+        whole = begin + file.read().rfind(b"\n") + 1
+    if whole < size and (whole > begin or not begin):
         os.truncate(log, whole)

@@ -28,15 +28,16 @@ class PatientReferee:
     def __init__(self, referee: Referee, end_ns: int) -> None:
         self._referee = referee
         self._end_ns = end_ns
-        self._waiting: deque[tuple[int, int, Frame]] = deque()
+        self.waiting: deque[tuple[int, int, Frame]] = deque()
+        """Frames that have not been judged"""
         self._holds = False
         self._judged_ns = -NEVER_NS
 
     def hear(self, now_ns: int, frames: Sequence[tuple[int, int, Frame]]) -> None:
         """Takes frames with run time [ns] and number of the bus, and judges those that have waited long enough."""
-        waiting, until_ns = self._waiting, min(now_ns - HOLD_NS, self._end_ns)
-        waiting.extend(frames)
-        while not self._holds and waiting and waiting[0][0] <= until_ns:
+        waiting = self.waiting
+        waiting.extend(frame for frame in frames if frame[0] <= self._end_ns)
+        while not self._holds and waiting and waiting[0][0] <= now_ns - HOLD_NS:
             self._judge(*waiting.popleft())
 
     def hold(self) -> None:
@@ -54,7 +55,7 @@ class PatientReferee:
         if self._judged_ns > until_ns:
             return None
         later = 0
-        for time_ns, bus, frame in self._waiting:
+        for time_ns, bus, frame in self.waiting:
             if time_ns <= until_ns:
                 self._judge(time_ns, bus, frame)
             else:

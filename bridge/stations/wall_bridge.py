@@ -84,7 +84,7 @@ class WallBridge(Bridge):
         self.in_time = 0
         self._messages = 0
         self.behind = False
-        """More frames have come than were read at once"""
+        """More frames may have come than were read at once"""
         self._stopped = False
         """The wheels have been stopped, and nothing is sent any more"""
         self._tell_wheels, self._watch = tell_wheels, watch

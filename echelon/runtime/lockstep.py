@@ -98,6 +98,7 @@ class LockstepRunner(Runner):
         """Waits until the main thread has work; returns False if it has none for `wait_s`."""
         self._idle = True
         if self._stopping:
+            self._idle = False  # a second order to stop must not end what is done now
             raise SystemExit(0)
         woken = not self._in_handler or self._wake.wait(wait_s)
         self._idle = False

@@ -172,6 +172,7 @@ class PacedRunner(Runner):
         """Sleeps until an instant of `time.monotonic_ns`, or until the main thread has work."""
         self._idle = True
         if self._stopping:
+            self._idle = False  # a second order to stop must not end what is done now
             raise SystemExit(0)
         self._wake.wait(max(0, until_ns - time.monotonic_ns()) * 1e-9)
         self._wake.clear()

@@ -6,7 +6,8 @@ mirror        wall       run_mirror_bridge     none                 run_wall_ref
 closed        virtual    run_lockstep          run_lockstep         none
 closed        wall       run_wall_bridge       run_wall_drives      run_wall_referee
 
-The referee has sockets of its own, and judges what was on the buses.  Without a referee, can.log is judged after the run.
+The referee has sockets of its own, and judges what was on the buses.  Where it cannot (docs/architecture.md, 5.7), can.log is
+judged after the run.
 """
 
 import gc

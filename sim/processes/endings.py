@@ -29,14 +29,14 @@ Serve = Callable[[float], None]
 def stop_wheels(children: Sequence[Child], serve: Serve) -> None:
     """Has the bridge take the torque away from all wheels and disable their drives, before anything else ends.
 
-    The referee hears of it first, so that it does not judge the frames of this stop."""
+    Then the referee hears of it, so that it does not judge the frames of this stop."""
+    bridges = [child for child in children if child.spec.kind == "bridge" and child.ready]
+    for child in bridges:
+        _order(child)
     for child in children:
         if child.spec.kind == "referee" and child.ready and child.alive:
             with suppress(OSError):
                 child.control.send(BreakOff())
-    bridges = [child for child in children if child.spec.kind == "bridge" and child.ready]
-    for child in bridges:
-        _order(child)
     deadline_s = time.monotonic() + ZERO_S
     while time.monotonic() < deadline_s and any(
         child.alive and child.done is None and not child.pulse.has_stopped for child in bridges
@@ -136,8 +136,8 @@ def _finish(
     after `GRACE_S`, and then the run has failed.  What has not finished `GRACE_S` later is given up."""
     try:
         child.control.send(order)
-    except OSError as error:
-        return failure or str(error)
+    except OSError:
+        return failure or _lost(child)
     begun_s, continued = time.monotonic(), False
     while child.done is None and child.alive:
         try:

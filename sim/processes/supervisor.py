@@ -144,7 +144,7 @@ class Supervisor:
         begun_s = self.progress.started_s
         wall_s = max(0.0, time.monotonic() - begun_s) if begun_s else 0.0
         try:
-            standstills = self._standstills()
+            standstills = self._standstills()  # a process that goes on to end stands still no more
             if broken:
                 stop_wheels(self._children, self._hearing.serve)
                 if failure is not None:

@@ -14,7 +14,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class BreakOff:
-    """To the referee: the run breaks off, and the bridge is about to stop the wheels."""
+    """To the referee: the run breaks off, and the bridge stops the wheels, or has stopped them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,8 @@ from echelon.sim.results.trace import Trace
 
 LARGEST: Final = 1 << 63
 """Numbers in messages are smaller than this"""
+LATEST_S: Final = 1e9
+"""No instant of a run is this late [s]"""
 LONGEST: Final = 100_000
 """How many characters a text has at most that is shown while the run goes on"""
 _NOTHING: Final = object()
@@ -67,6 +69,9 @@ def understood(said: object, spec: ProcessSpec, plan: Plan) -> bool:
             return spec.kind == "recorder" and of_plan and _has_robot(said, plan) and len(said.failure or "") <= LONGEST
         case Done():
             kind = REPORTS.get(spec.kind, NoneType)
+            stopped = said.report.wheels_stopped if isinstance(said.report, CanReport) else None
+            if stopped is not None and not abs(stopped) < LATEST_S:
+                return False
             return said.name == spec.name and type(said.report) in (kind, NoneType) and _has_robot(said.report, plan)
     return True
 

@@ -11,7 +11,7 @@ from echelon.bridge.can.bus import Bus, open_bus
 from echelon.bridge.protocols.frame import Frame
 from echelon.bridge.referee.patient import PatientReferee
 from echelon.bridge.referee.referee import Referee
-from echelon.bridge.stations.waiting import PROGRESS_NS, Mail, RunClock, drained, wait_for
+from echelon.bridge.stations.waiting import AT_ONCE, FLOOD, PROGRESS_NS, Mail, RunClock, drained, wait_for
 from echelon.bridge.stations.wall_bridge import WallBridge
 from echelon.bridge.stations.wall_drives import WallDrives
 from echelon.errors import PartRunError
@@ -51,37 +51,42 @@ def run_wall_bridge(spec: ProcessSpec, session: Session, control: Connection, wa
     clock = bridge.clock = RunClock(watch.pulse.from_ns)
     bridge.mail.now = clock.now
     signal.signal(STOP, lambda number, frame: None)  # the watch hears of it
-    until_ns = plan.duration_ns + ALONE_NS
-    said_ns = -1 << 62
-    begun, order = False, None
 
-    def serve() -> None:
-        nonlocal begun, order, said_ns
-        while not watch.asked and order is None and clock.now() < until_ns:
+    def serve() -> Finish | None:
+        """Serves the buses until the end of the run; returns the order to finish, if it has come."""
+        said_ns, begun = -1 << 62, False
+        while clock.now() < plan.duration_ns + ALONE_NS:
             left_ns = min(max(bridge.due_ns - clock.now(), 0), PROGRESS_NS)
             now_ns = time.monotonic_ns()
             watch.pulse.beat(now_ns, now_ns + left_ns)
             wait_for([control, watch, *bridge.sources], left_ns)
+            if watch.asked:
+                return None
             now_ns = clock.now()
             bridge.serve()
-            if (
-                not begun and now_ns >= plan.can.watchdog_ns and not bridge.behind
-            ):  # drives' reports until then are read
+            # what drives have reported until the watchdog's time is read, unless somebody floods the bus
+            if not begun and now_ns >= plan.can.watchdog_ns * (2 if bridge.behind else 1):
                 begun = True
                 if faults := bridge.faults_of_start():
                     raise StartError(f"{faults}: drives must be free of faults when a run begins; {BUSY}")
             if now_ns - said_ns >= PROGRESS_NS:
                 said_ns = now_ns
                 tell(control, bridge.progress())
-            order = hear_finish(control)
+            if (order := hear_finish(control)) is not None:
+                return order
+        return None
 
+    order: Finish | None = None
     failure: StartError | PartRunError | None = None
     try:
-        for step in serve, stop:
-            try:
-                step()
-            except (StartError, PartRunError) as error:
-                failure = failure or error
+        try:
+            order = serve()
+        except (StartError, PartRunError) as error:
+            failure = error
+        try:
+            stop()
+        except PartRunError as error:
+            failure = failure or error
         if failure is not None:
             control.send(failed(failure))
         watch.pulse.rest()
@@ -151,16 +156,19 @@ def run_wall_referee(spec: ProcessSpec, session: Session, control: Connection, w
         order = control.recv() if control.poll() else None
         if isinstance(order, BreakOff):
             referee.hold()
-        frames = [
-            (clock.of(received.time_ns), number, Frame(received.can_id, received.data, received.remote))
-            for number, bus in enumerate(buses)
-            for received in drained(bus)
-        ]
-        referee.hear(clock.now(), frames)
+        most = FLOOD if isinstance(order, Finish) else AT_ONCE  # at the end everything that has come
+        counts = []
+        for number, bus in enumerate(buses):
+            frames = [
+                (clock.of(received.time_ns), number, Frame(received.can_id, received.data, received.remote))
+                for received in drained(bus, most)
+            ]
+            referee.hear(clock.now(), frames)
+            counts.append(len(frames))
     watch.pulse.rest()
     report = referee.finish(clock.now(), order.wheels_stopped_ns)
     # robots must not be blamed for what the referee did not hear: then can.log is judged instead
-    deaf = any(bus.missed for bus in buses)
+    deaf = any(bus.missed for bus in buses) or max(counts) == FLOOD
     for bus in buses:
         bus.close()
     finish(spec, control, report=None if deaf else report)

@@ -12,6 +12,9 @@ def drives(evidence: Evidence) -> Iterator[CheckResult]:
     plan, can = evidence.plan, evidence.can
     if can is None or not plan.can.closed:
         return
+    if not can.robots:
+        yield CheckResult("drives", "not tested", "the bridge gave no report", unit="robots")
+        return
     planned = {plan.robots[robot].name for event in plan.events for robot in event.robots}
     upset = {bus for event in plan.events for bus in event.buses}
     planned |= {robot.name for robot in plan.robots if robot.drive.bus in upset}

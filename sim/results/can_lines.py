@@ -20,7 +20,7 @@ def can_lines(can: CanReport | None) -> Iterator[str]:
     facts += [f"{lost} lost"] if lost else []
     if can.path == "closed":
         facts += [f"{destroyed} destroyed and sent again"] if destroyed else []
-    else:
+    elif can.robots:  # the bridge has counted
         facts.append(f"{sum(robot.clipped for robot in can.robots.values())} clipped")
     if len(can.fit) == 1:
         yield f"  CAN      {', '.join(facts)}; {can.fit[0]}"

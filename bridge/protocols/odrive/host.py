@@ -57,7 +57,7 @@ class _Axis:
     gives: bool = False
     """It has reported torque since torque is commanded"""
     zero_ns: int | None = None
-    """Since when it has reported nothing but zero torque though torque is commanded; None: it has not"""
+    """Since when it reports zero torque though torque is commanded; None: it does not"""
     heard_ns: int | None = None
     prepared_ns: int | None = None
     """When its mode was sent, if Set_Axis_State has yet to follow"""
@@ -213,8 +213,11 @@ class ODriveHost:
             return
         axis.heard_ns = time_ns
         if command is Command.GET_TORQUES:
+            if values == (0.0, 0.0):
+                self._zero_torque(axis, time_ns)
+            elif axis.pushed_ns is not None:
+                axis.gives, axis.zero_ns = True, None
             axis.torque, axis.torque_ns = values[1], time_ns
-            self._zero_torque(axis, time_ns, values == (0.0, 0.0))
         elif command is Command.HEARTBEAT:
             self._heartbeat(axis, time_ns, values[0], values[1])
         elif command is Command.GET_ERROR and values[0]:
@@ -244,20 +247,20 @@ class ODriveHost:
         axis.errors = errors
         axis.fail(time_ns, error_names(errors))
 
-    def _zero_torque(self, axis: _Axis, time_ns: int, zero: bool) -> None:
+    def _zero_torque(self, axis: _Axis, time_ns: int) -> None:
         """Finds a disarmed axis, which reports exactly zero torque: that shows before its next heartbeat.
 
-        Three periods allow for commands that are delayed or lost.  Where no torque has come yet, reports over two of them
-        allow for a host or a drive that stood still: it then reads, or sends, all reports from before the command at once."""
+        Three periods allow for commands that are delayed or lost.  After a standstill of host or drive, reports from before the
+        command come all at once.  So one report counts only if it comes by itself, from an axis that gave torque; otherwise it
+        takes reports over two periods."""
         if axis.pushed_ns is None or not axis.closed:
-            return
-        if not zero:
-            axis.gives = True
             return
         if axis.zero_ns is None:
             axis.zero_ns = time_ns
         period_ns = self.plan.period_ns
-        if time_ns - axis.pushed_ns >= 3 * period_ns and (axis.gives or time_ns - axis.zero_ns >= 2 * period_ns):
+        alone = axis.torque_ns is None or time_ns - axis.torque_ns >= period_ns // 2
+        sure = (axis.gives and alone) or time_ns - axis.zero_ns >= 2 * period_ns
+        if sure and time_ns - axis.pushed_ns >= 3 * period_ns:
             axis.fail(time_ns, NO_TORQUE)
 
     def _heartbeat(self, axis: _Axis, time_ns: int, errors: int, state: int) -> None:

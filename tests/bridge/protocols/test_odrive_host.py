@@ -273,6 +273,20 @@ def test_an_axis_that_gives_no_torque(cycles: int, report: Frame, fault: str) ->
     assert (host.fault, host.enabled) == (fault, not fault)
 
 
+def test_a_report_from_before_a_pause_does_not_make_zero_reports_of_the_pause_a_fault() -> None:
+    robot = Robot().up()
+    host, at_ns = robot.host, robot.now_ns
+    for cycle, torque in enumerate((0.5, 0.0, 0.5, 0.5, 0.5, 0.5, 0.5)):
+        host.command(at_ns + cycle * PERIOD_NS, torque, 0.0)
+    late_ns = at_ns + 7 * PERIOD_NS  # the host stood still, and reads all at once
+    host.receive(late_ns, frame(1, "Get_Torques", Torque_Target=0.5, Torque_Estimate=0.5))
+    for number in range(3):
+        host.receive(late_ns + 10_000 * number, NOTHING)
+    assert host.fault == ""
+    host.receive(late_ns + PERIOD_NS, NOTHING)
+    assert host.fault == "right: gives no torque"
+
+
 @pytest.mark.parametrize("gives", [True, False])
 def test_reports_that_come_all_at_once_after_a_standstill_are_no_fault(gives: bool) -> None:
     """Host or drive stood still: the reports are from before the command.  Later ones tell whether the axis gives torque."""

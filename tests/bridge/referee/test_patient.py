@@ -79,6 +79,23 @@ def test_the_stop_of_a_run_is_no_finding_and_what_came_before_is_judged(told_ns:
     assert report.kinds["counter gap"] > 0
 
 
+def test_what_comes_after_the_end_of_a_run_is_left_out_and_not_kept() -> None:
+    plan, heard = whole_run()
+    end_ns = plan.duration_ns - 200 * MS  # as if the run had ended there
+    late = [one for one in heard if one[0] > end_ns]
+    assert len(late) > 100
+    reports = []
+    for frames in [one for one in heard if one[0] <= end_ns], heard:
+        referee = PatientReferee(Referee(plan), end_ns)
+        rest = listened(referee, frames, plan.duration_ns)
+        referee.hear(plan.duration_ns, rest)
+        assert not any(time_ns > end_ns for time_ns, _, _ in referee.waiting)
+        reports.append(referee.finish(plan.duration_ns + 2 * HOLD_NS, plan.duration_ns))
+    assert reports[0] == reports[1]
+    assert reports[0] is not None
+    assert (reports[0].kinds, reports[0].until) == ({}, None)
+
+
 def test_a_stop_that_is_told_too_late_or_never_gives_no_report() -> None:
     plan, heard, _ = broken_off()
     assert finished(heard, plan, STOP_NS + HOLD_NS + 2 * LOOK_NS, STOP_NS) is None

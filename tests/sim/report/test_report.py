@@ -118,7 +118,6 @@ def test_the_page_needs_nothing_but_itself(single):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_ids_are_unique_or_repeat_the_same_thing(both):
     ids = {value for _, key, value in both.attributes if key == "id"}
     used = {value[1:] for _, key, value in both.attributes if key.endswith("href")}
@@ -126,7 +125,6 @@ def test_ids_are_unique_or_repeat_the_same_thing(both):
     assert used == ids
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_every_figure_has_words_for_those_who_do_not_see_it(single, both):
     for page, figures in ((single, FIGURES), (both, 2 * FIGURES + COMPARED)):

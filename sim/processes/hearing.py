@@ -29,6 +29,19 @@ NOT_UNDERSTOOD: Final = "not understood"
 """Why the supervisor refuses what a process says over its pipe"""
 
 
+class LostError(RunError):
+    """A process has ended without its report.
+
+    How it ended is asked when the text is needed: to learn it may take a second, and the wheels stop first."""
+
+    def __init__(self, child: Child) -> None:
+        self._child = child
+
+    def __str__(self) -> str:
+        child = self._child
+        return f"lost {child.kind_and_name} ({child.ending()}){last_words_of([child])}"
+
+
 class Hearing:
     """Reads what children say, and notes it in them and in the progress of the run.
 
@@ -116,4 +129,4 @@ class Hearing:
                 if child.done is None:
                     if not child.words.closed:
                         child.hear_words()
-                    raise RunError(f"lost {child.kind_and_name} ({child.ending()}){last_words_of([child])}")
+                    raise LostError(child)

@@ -129,24 +129,26 @@ class Supervisor:
         failure: str | None = None
         stall: StallError | None = None
         error: BaseException | None = None
+        broke: RunError | None = None
         diverged = False
         try:
             self._until_members_are_done()
         except StallError as stalled:
             stall, failure = stalled, stalled.text(f"t = {self.progress.time_ns / 1e9:g} s")
         except RunError as why:
-            failure = str(why)
+            broke = why
         except DivergedError as why:
             diverged, self.progress.note = True, f"{why}: the run stops"
         except BaseException as other:
             error, failure = other, f"{type(other).__name__}: {other}"
-        broken = diverged or failure is not None
+        broken = diverged or failure is not None or broke is not None
         begun_s = self.progress.started_s
         wall_s = max(0.0, time.monotonic() - begun_s) if begun_s else 0.0
         try:
             standstills = self._standstills()  # a process that goes on to end stands still no more
             if broken:
                 stop_wheels(self._children, self._hearing.serve)
+                failure = failure if broke is None else str(broke)
                 if failure is not None:
                     failure = self._signalled() or failure
                     self.progress.note = failure.splitlines()[0]

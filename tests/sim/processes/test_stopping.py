@@ -161,6 +161,26 @@ def test_a_bridge_that_stands_still_on_a_wall_clock_is_blamed_at_once(tmp_path: 
         assert any("stood still: bridge for" in text for text in failed)
 
 
+def test_wheels_stop_before_it_is_asked_how_a_process_ended(tmp_path: Path) -> None:
+    """The fork server tells it, which may take its time."""
+    with lateness(tmp_path / "late") as machine, running(tmp_path, *WALL) as (command, ear):
+        assert until(lambda: ear.torque and ear.commands_torque)
+        lost = whom(command, "referee")
+        server = int(Path(f"/proc/{lost}/stat").read_text().rpartition(")")[2].split()[1])
+        os.kill(server, signal.SIGSTOP)
+        try:
+            at_s = time.time()
+            os.kill(lost, signal.SIGKILL)
+            assert until(lambda: not ear.torque and not ear.commands_torque)
+            late_s = 2 * sum(machine.of(at_s, ear.turning_s))
+            assert ear.turning_s - at_s < 0.5 + late_s
+        finally:
+            os.kill(server, signal.SIGCONT)
+        code, err = ended(command)
+        assert code == 3
+        assert "echelon: lost referee (" in err
+
+
 def test_a_leader_that_stood_still_for_a_while_is_named_and_fails_the_verdict(tmp_path: Path) -> None:
     text = SCENARIO.replace("duration = 1000.0", "duration = 6.0")
     text = text.replace("formation.robots", "formation.groups.team.robots").replace("[0.5]", "[0.5, 0.5]")

@@ -9,17 +9,19 @@ from echelon.bridge.reports import BusReport, CanReport
 from echelon.bridge.timing.bus_load import BitCount
 from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
-from echelon.plan.plan import Plan
+from echelon.plan.plan import Plan, on_wall_clock
 
 LONGEST_LINE: Final = 4096
 """No line of can.log is longer [bytes]"""
 
 
-def report_of_log(plan: Plan, log: Path) -> CanReport:
-    """Returns the report on the buses, as far as can.log shows it; counts that it does not show are None.
+def report_of_log(plan: Plan, log: Path, clock: str) -> CanReport:
+    """Returns the report on the buses, as far as can.log shows it; counts that it does not show are None.  `clock` is
+    that of the run, `virtual` or `wall`.
 
     An unfinished last line is removed from the log.  Raises OSError, and PartRunError if a user's own protocol fails."""
     _drop_cut_line(log)
+    plan = on_wall_clock(plan) if clock == "wall" else plan
     start_ns = plan.can.bring_up_ns if plan.can.closed else 0
     counts, frames, last_ns = [BitCount() for _ in plan.can.buses], 0, -start_ns
     for time_ns, bus, (can_id, data, remote) in read_run_log(log, plan):

@@ -127,7 +127,7 @@ def _rebuild(folder: Path, recording: Path, result: RecoverResult) -> list[str]:
     )
     log, can = folder / "can.log", None
     if log.exists():
-        can = report_of_log(plan, log)
+        can = report_of_log(plan, log, facts.clock)
         if can.frames:
             can = replace(can, referee=judged(log, plan, Terms.of(plan, facts.clock, whole=False)))
         for bus, name in enumerate(dbc_names(plan)):

@@ -31,7 +31,7 @@ from echelon.role import Role
 from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.session import Session
 from echelon.runtime.wire import encode, join, watch_key
-from echelon.sim.processes.contract import Body, ProcessSpec, StartError, failed, finish, hear_finish, meet, tell
+from echelon.sim.processes.contract import Body, ProcessSpec, failed, finish, hear_finish, meet, tell
 from echelon.sim.processes.to_supervisor import Said, Waiting
 from echelon.sim.processes.wall_bus_processes import made, run_wall_bridge, run_wall_drives, run_wall_referee
 from echelon.sim.processes.watch import STOP, Watch
@@ -152,14 +152,12 @@ def run_lockstep(spec: ProcessSpec, session: Session, control: Connection, watch
     done = threading.Event()
     teller = threading.Thread(target=_tell, args=(station, say_if_room, done), name="progress", daemon=True)
     teller.start()
-    failure: StartError | PartRunError | None = None
+    failure: BusError | PartRunError | None = None
     try:
         runner.run(lambda time_ns, sources: say_if_room(Waiting(time_ns, tuple(sources))))
     except SystemExit:  # the run breaks off, but the counts so far are still reported
         pass
-    except BusError as error:
-        failure = StartError(str(error))
-    except PartRunError as error:
+    except (BusError, PartRunError) as error:
         failure = error
     finally:
         try:

@@ -90,9 +90,9 @@ class StartError(Exception):
     """This process cannot start; the text says why, for the user."""
 
 
-def failed(error: StartError | PartRunError) -> Failed | PartFailed:
-    """Returns what the supervisor is told of a failure that is not this program's."""
-    return Failed(str(error)) if isinstance(error, StartError) else PartFailed(str(error))
+def failed(error: Exception) -> Failed | PartFailed:
+    """Returns what the supervisor is told of a failure that is not this program's: that of a user's part, or another."""
+    return PartFailed(str(error)) if isinstance(error, PartRunError) else Failed(str(error))
 
 
 def meet(spec: ProcessSpec, session: Session, control: Connection) -> int:

@@ -8,9 +8,9 @@ from contextlib import suppress
 from typing import Final
 
 from echelon.bridge.reports import CanReport
-from echelon.sim.processes.children import Child, last_words_of
+from echelon.sim.processes.children import Child
 from echelon.sim.processes.contract import FINISHING
-from echelon.sim.processes.failures import DivergedError, RunError, few
+from echelon.sim.processes.failures import DivergedError, LostError, RunError, few
 from echelon.sim.processes.stalls import STALL_REPORT_S
 from echelon.sim.processes.to_process import BreakOff, End, Finish
 from echelon.sim.processes.to_supervisor import RecorderReport
@@ -137,7 +137,7 @@ def _finish(
     try:
         child.control.send(order)
     except OSError:
-        return failure or _lost(child)
+        return failure or str(LostError(child))
     begun_s, continued = time.monotonic(), False
     while child.done is None and child.alive:
         try:
@@ -148,18 +148,12 @@ def _finish(
         if not failure and waited_s > STALL_REPORT_S:
             say(f"waits for {child.name} to finish ({child.state()}{child.runs()})")
         if stopped and not continued and (failure or waited_s > GRACE_S):
-            failure = failure or _lost(child)
+            failure = failure or str(LostError(child))
             child.signal(signal.SIGCONT)
             begun_s, continued = time.monotonic(), True
         elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
             break
-    return failure or (_lost(child) if child.done is None else None)
-
-
-def _lost(child: Child) -> str:
-    """Returns in words that a process does not finish."""
-    still = f", {child.state()}{child.runs()}" if child.alive else ""
-    return f"lost {child.spec.kind} ({child.ending()}{still}){last_words_of([child])}"
+    return failure or (str(LostError(child)) if child.done is None else None)
 
 
 def take_down(children: Sequence[Child]) -> None:

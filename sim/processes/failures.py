@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Final
 
+from echelon.sim.processes.children import Child, last_words_of
+
 NAMED: Final = 12
 """The largest number of processes that a note names; the others are counted."""
 
@@ -21,6 +23,21 @@ class StallError(RunError):
     def text(self, when: str) -> str:
         """Returns what happened, in words.  `when` it happened is certain only after the recorder has reported."""
         return f"stalled for {self._still_s:.0f} s at {when}: {self._who}"
+
+
+class LostError(RunError):
+    """A process has ended without its report, or does not end.
+
+    How it ended is asked when the text is needed: to learn it may take a second, and the wheels stop first."""
+
+    def __init__(self, child: Child) -> None:
+        super().__init__()
+        self._child = child
+
+    def __str__(self) -> str:
+        child = self._child
+        still = f", {child.state()}{child.runs()}" if child.alive else ""
+        return f"lost {child.kind_and_name} ({child.ending()}{still}){last_words_of([child])}"
 
 
 class DivergedError(Exception):

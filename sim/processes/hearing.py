@@ -10,8 +10,8 @@ from typing import Any, Final
 from echelon.bridge.reports import BridgeProgress
 from echelon.plan.plan import Plan
 from echelon.runtime.admission import Refusals
-from echelon.sim.processes.children import Child, last_words_of
-from echelon.sim.processes.failures import DivergedError, RunError
+from echelon.sim.processes.children import Child
+from echelon.sim.processes.failures import DivergedError, LostError, RunError
 from echelon.sim.processes.outcome import Progress
 from echelon.sim.processes.to_supervisor import (
     Done,
@@ -27,19 +27,6 @@ from echelon.sim.processes.understood import understood
 
 NOT_UNDERSTOOD: Final = "not understood"
 """Why the supervisor refuses what a process says over its pipe"""
-
-
-class LostError(RunError):
-    """A process has ended without its report.
-
-    How it ended is asked when the text is needed: to learn it may take a second, and the wheels stop first."""
-
-    def __init__(self, child: Child) -> None:
-        self._child = child
-
-    def __str__(self) -> str:
-        child = self._child
-        return f"lost {child.kind_and_name} ({child.ending()}){last_words_of([child])}"
 
 
 class Hearing:

@@ -91,9 +91,16 @@ class Outcome:
 
 
 def outcome_of(
-    plan: Plan, processes: list[Done], failure: str | None, startup_s: float, wall_s: float, log: Path | None
+    plan: Plan,
+    processes: list[Done],
+    failure: str | None,
+    startup_s: float,
+    wall_s: float,
+    log: Path | None,
+    clock: str,
 ) -> Outcome:
-    """Returns the outcome of a run from the reports of its processes; `log` is its can.log, if it has buses.
+    """Returns the outcome of a run from the reports of its processes; `log` is its can.log, if it has buses, and
+    `clock` is `virtual` or `wall`.
 
     A run whose recorder gave no report has an empty trace.  If its bridge gave none, the report on the buses is what can.log
     shows."""
@@ -101,7 +108,7 @@ def outcome_of(
     can, drives = _report(CanReport, processes), _report(DrivesReport, processes)
     if can is None and log is not None:
         with suppress(OSError, UserError):  # a run that failed early has no log
-            found = report_of_log(plan, log)
+            found = report_of_log(plan, log, clock)
             can = found if found.frames else None
     if can is not None:
         can = replace(can if drives is None else can.with_drives(drives), referee=_report(RefereeReport, processes))

@@ -167,7 +167,9 @@ class Supervisor:
         if error is not None:
             raise error
         processes = [child.done for child in self._children if child.done is not None]
-        outcome = outcome_of(self.plan, processes, failure, self._startup_s, wall_s, self._log)
+        outcome = outcome_of(
+            self.plan, processes, failure, self._startup_s, wall_s, self._log, "virtual" if self.virtual else "wall"
+        )
         outcome.standstills = standstills
         outcome.refused_here = self._hearing.refusals.by_source()
         common_ns = outcome.trace.common_ns()

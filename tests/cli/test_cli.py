@@ -306,6 +306,7 @@ def test_export_overwrites_tables_only_where_it_is_told_to(folder: Path, tmp_pat
 def test_report_of_two_runs(folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "both.html"
     done = echelon("report", folder, folder, "--out", page, "--json")
+    assert done.returncode == 0, done.stderr
     assert page.stat().st_size > 10_000
     assert json.loads(done.stdout) == {"report": str(page), "figures": [], "runs": [str(folder), str(folder)]}
 

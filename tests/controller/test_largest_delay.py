@@ -83,9 +83,8 @@ def test_long_delays_have_an_answer():
         assert (found.ends, found.tried) == ("unstable", False)
         assert found.ticks == pytest.approx(expected, abs=1)
         assert found.ticks is not None
-        if lead:  # eigenvalues of 2,100 variables take their time
-            assert radius(plan, edges_of(plan, Channel.STATE), found.ticks * MS) < 1
-            assert radius(plan, edges_of(plan, Channel.STATE), (found.ticks + 1) * MS) > 1
+        assert radius(plan, edges_of(plan, Channel.STATE), found.ticks * MS) < 1
+        assert radius(plan, edges_of(plan, Channel.STATE), (found.ticks + 1) * MS) > 1
 
 
 def test_near_its_edge_a_loop_bears_no_tick_more():
@@ -174,7 +173,7 @@ def test_in_a_chain_of_late_links_every_delay_up_to_the_largest_is_stable(seed, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 5, 8])
+@pytest.mark.parametrize("seed", [2, 5, 7, 8])
 def test_points_of_random_formations_grow_beyond_the_largest_delay_and_not_before(seed, monkeypatch):
     """Trees of up to four layers, several periods, full gains and couplings: the engine with points, each link class."""
     plan = at_rest(random_formation(seed))

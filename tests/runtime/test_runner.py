@@ -248,6 +248,16 @@ def test_a_stall_names_the_members_that_it_waits_for(monkeypatch: pytest.MonkeyP
     assert member.watched() == member.said
 
 
+def test_a_second_order_to_stop_ends_nothing_more() -> None:
+    """The first one comes while stages run: the run ends before it waits, and then reports."""
+    plan, _ = story()
+    member = Member(plan, make_role(plan, plan.robots[0].index))
+    member.runner.stop()
+    member.thread.start()
+    assert isinstance(member.join(), SystemExit)
+    member.runner.stop()  # would end the report
+
+
 def test_garbage_is_counted_and_dropped() -> None:
     plan, messages = story()
     robot = plan.robots[0]

@@ -158,6 +158,8 @@ def hostile(child: Child, plan: Plan, count: int) -> Iterator[bytes]:
         LinksProgress((replace(link, source=10**6),)),
         replace(done, name="somebody"),
     ]
+    if child.spec.kind == "bridge":
+        fixed += [replace(done, report=replace(done.report, wheels_stopped=at)) for at in (nan, float("inf"), -1e12)]
     fixed += [replace(progress, lost=Lost(10**6, 0)), replace(progress, states=states[:1]), BridgeProgress(load=nan)]
     fixed += [replace(done, report=each) for kind, each in report.items() if kind != child.spec.kind]
     fixed += [

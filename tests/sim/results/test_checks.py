@@ -184,6 +184,10 @@ CASES: dict[str, dict[str, tuple[Callable[[], Summary], str]]] = {
     "drives": {
         "passed": (lambda: closed(), "the drives of 9 robots came up"),
         "failed": (lambda: closed(fault="over-temperature"), "g1/r1 in fault at the end (over-temperature)"),
+        "not tested": (
+            lambda: judged(decaying(0.1, "can.path=closed"), can=can_report(path="closed", robots={}, referee=CLEAN)),
+            "the bridge gave no report",
+        ),
     },
     "referee": {
         "passed": (lambda: judged(decaying()), "nothing breaks the contract in 7 frames"),

@@ -116,11 +116,14 @@ def test_candump_and_cantools_show_newton_metres(bus: Bus, tmp_path: Path) -> No
         while not somebody_listens() and time.monotonic() < limit:
             assert one.poll() is None
         assert one.stdout is not None
-        pipe = one.stdout.fileno()
+        assert two.stdout is not None
+        pipe, shown = one.stdout.fileno(), list[str]()
+        reader = threading.Thread(target=shown.extend, args=(two.stdout,))
+        reader.start()
         # candump waits when the pipe is full, and the kernel drops what it then does not read
         run(bus, lambda: int.from_bytes(fcntl.ioctl(pipe, termios.FIONREAD, bytes(4)), sys.byteorder))
         one.stdout.close()
-        shown = two.communicate(timeout=600)[0].splitlines()
+        reader.join(600)
     assert len(shown) == total
     number = r"(-?[0-9.e-]+)"
     for index, line in enumerate(shown):

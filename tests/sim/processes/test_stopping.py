@@ -295,13 +295,19 @@ def test_when_the_supervisor_stands_still_the_wheels_stop_at_the_end_of_the_run(
 
 def test_timeout_and_systemd_end_a_run_with_its_report(tmp_path: Path) -> None:
     """They send SIGTERM to the process and to all of its group."""
-    with running(tmp_path, *WALL, REPORT) as (command, ear):
+    with lateness(tmp_path / "late") as machine, running(tmp_path, *WALL, REPORT) as (command, ear):
+        at_s = time.time()
         os.kill(command.pid, signal.SIGTERM)
         os.killpg(command.pid, signal.SIGTERM)
         code, err = ended(command)
         assert code == 3, err
         assert not ear.enabled
         assert (tmp_path / "run" / "report.html").exists()
+        referee = summary_of(tmp_path / "run")["can"]["referee"]
+        late = any(late_s > 0.5 for late_s in machine.of(at_s, time.time()))
+        assert referee["source"] == "bus" or late  # it hears of the stop within a second
+        assert referee["kinds"] == {} or late
+        assert referee["frames"] > 0
 
 
 def test_a_mirrored_run_ends_with_zero_and_disable(tmp_path: Path) -> None:

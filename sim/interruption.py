@@ -10,6 +10,7 @@ the first count as the same.  A signal that the caller ignores stays ignored, as
 """
 
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -69,16 +70,24 @@ def interruption() -> Iterator[Interruption]:
     """A context in which the signals are noted.
 
     Python handles signals only in the main thread, so in other threads nothing is noted.  Raises KeyboardInterrupt if a signal
-    was noted by a context around this one, and a library kept its KeyboardInterrupt to itself."""
+    was noted by a context around this one, and its KeyboardInterrupt was lost: a library kept it to itself, or Python ignored
+    it, as it does in a destructor."""
     noted = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield noted
         return
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before, hook = {number: signal.getsignal(number) for number in SIGNALS}, sys.unraisablehook
     around = (getattr(handler, "__self__", None) for handler in before.values())
     if any(isinstance(other, Interruption) and other.asked for other in around):
         raise KeyboardInterrupt
+
+    def tell(ignored: "sys.UnraisableHookArgs") -> None:
+        """Tells of an exception that Python ignores, but not of ours: the signal is noted."""
+        if not isinstance(ignored.exc_value, KeyboardInterrupt):
+            hook(ignored)
+
     try:
+        sys.unraisablehook = tell
         for number, handler in before.items():
             if handler is not signal.SIG_IGN:
                 signal.signal(number, noted.note)
@@ -86,3 +95,4 @@ def interruption() -> Iterator[Interruption]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        sys.unraisablehook = hook

@@ -67,7 +67,7 @@ def own_law(run: Any, block: Any, table: Any, index: Any, real: Any, e: int, rat
             at = e + 2 * row - row % 2
             value = _led(run, real[at], block.sigma * real[at + 2], block.ahead / block.sigma)
             real[eta + row] = value / (block.sigma * block.sigma)
-    elif block.diagonal:
+    elif block.is_diagonal:
         for row in range(size):
             at = e + 2 * row - row % 2
             real[eta + row] = -table[block.k1_at + row] * real[at] - table[block.k2_at + row] * real[at + 2]
@@ -83,7 +83,7 @@ def own_law(run: Any, block: Any, table: Any, index: Any, real: Any, e: int, rat
         _integrate(block, table, real, e, eta)
     if force >= 0:
         for row in range(size):
-            if block.diagonal:
+            if block.is_diagonal:
                 real[eta + row] += table[block.pot_at + row] * real[force + row]
             else:
                 for column in range(size):
@@ -100,7 +100,7 @@ def _integrate(block: Any, table: Any, real: Any, e: int, eta: int) -> None:
     """Adds -K_i q to η, then integrates q."""
     size, q, T = block.rows, block.integral_at, block.period
     for row in range(size):
-        if block.diagonal:
+        if block.is_diagonal:
             real[eta + row] -= table[block.ki_at + row] * real[q + row]
         else:
             for column in range(size):

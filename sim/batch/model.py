@@ -181,7 +181,7 @@ class ModelMaker:
         bounds = list(accumulate(map(len, rows), initial=0))
         return {
             "rows": block.size,
-            "diagonal": diagonal,
+            "is_diagonal": diagonal,
             "k1_at": places[0],
             "k2_at": places[1],
             "ki_at": places[2],

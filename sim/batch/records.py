@@ -63,9 +63,9 @@ NODE: Final = _record(
     "",
 )
 BLOCK: Final = _record(
-    # number of its rows; gains in `table`, diagonals only where `diagonal`; W K̄ as sparse rows: bounds and columns in
+    # number of its rows; gains in `table`, diagonals only where `is_diagonal`; W K̄ as sparse rows: bounds and columns in
     # `indices`, values in `table`
-    "rows diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
+    "rows is_diagonal k1_at k2_at ki_at pot_at rows_at values_at integral_at measures_at marks_at response_ns",
     # α and 1/ω² of its amplitude (sim.results.rates), 0 if it does not oscillate
     "sigma ahead period bound alpha per_omega_squared",
 )

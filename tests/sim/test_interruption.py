@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,30 @@ def test_an_interrupt_that_a_library_kept_to_itself_is_raised_again() -> None:
         with pytest.raises(KeyboardInterrupt), interruption():
             pytest.fail("the run began")
         assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_interrupt_that_python_ignores_is_noted_and_nothing_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A signal may come in a destructor, or as an import ends: Python prints what is raised there, and goes on."""
+    told: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda ignored: told.append(str(ignored.exc_value)))
+
+    class Signalled:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    class Broken:
+        def __del__(self) -> None:
+            raise ValueError("broken")
+
+    with interruption() as noted:
+        Signalled()
+        assert noted.asked
+        Broken()
+        with pytest.raises(KeyboardInterrupt), interruption():
+            pytest.fail("the run began")
+    Broken()
+    assert told == ["broken", "broken"]
 
 
 def test_a_context_inside_another_notes_for_itself() -> None:

@@ -22,6 +22,9 @@ AT_ONCE: Final = 256
 FLOOD: Final = 100 * AT_ONCE
 """The same in virtual time, which waits: the frames that matter may be behind a flood"""
 
+SET_NS: Final = 1_000_000
+"""By how much the kernel's clock must have changed against the monotonic clock to count as set [ns]"""
+
 
 class Mail:
     """A mailbox for the robots' torques.
@@ -79,11 +82,16 @@ def drained(bus: Bus, most: int = AT_ONCE) -> Iterator[Received]:
 
 
 class RunClock:
-    """Run time [ns] on a wall clock.  Run time 0 is at `start_ns` of the monotonic clock; None means now."""
+    """Run time [ns] on a wall clock.  Run time 0 is at `start_ns` of the monotonic clock; None means now.
+
+    The kernel stamps frames by a clock that somebody may set while a run goes on.  A stamp that lies in the future, or long
+    before the stamp before it, shows that; then the two clocks are compared anew.  Stamps from before the clock was set may
+    still be to come."""
 
     def __init__(self, start_ns: int | None = None) -> None:
         self._start_ns = time.monotonic_ns() if start_ns is None else start_ns
-        self._epoch_ns = _epoch_of_monotonic_clock() + self._start_ns
+        self._epoch_ns = self._before_ns = _epoch_of_monotonic_clock() + self._start_ns
+        self._last_ns = self.now()
 
     def now(self) -> int:
         """Returns the present run time."""
@@ -91,7 +99,20 @@ class RunClock:
 
     def of(self, time_ns: int) -> int:
         """Returns the run time of a time stamp of the kernel [ns since 1970]."""
-        return time_ns - self._epoch_ns
+        found_ns, now_ns = time_ns - self._epoch_ns, self.now()
+        if not self._likely(found_ns, now_ns):
+            epoch_ns = _epoch_of_monotonic_clock() + self._start_ns
+            if abs(epoch_ns - self._epoch_ns) > SET_NS:
+                self._epoch_ns, self._before_ns = epoch_ns, self._epoch_ns
+                found_ns = time_ns - epoch_ns
+            if not self._likely(found_ns, now_ns) and self._likely(time_ns - self._before_ns, now_ns):
+                found_ns = time_ns - self._before_ns
+        self._last_ns = max(self._last_ns, min(found_ns, now_ns))
+        return found_ns
+
+    def _likely(self, found_ns: int, now_ns: int) -> bool:
+        """Returns whether a frame may have come at a run time: not in the future, and not long before the one before it."""
+        return self._last_ns - SET_NS <= found_ns <= now_ns + SET_NS
 
 
 def _epoch_of_monotonic_clock() -> int:

@@ -173,9 +173,12 @@ def _in_process(
         batch = gathered.copy()
         gathered.clear()  # before anything can raise, so that nothing is passed on twice
         recording.add(order.push(batch))
-        with patience_with_bridge(plan, stall_timeout_s):
-            frames = bridge.take(batch)
-        recording.add(order.push(frames))
+        copies: list[Message] = []
+        try:
+            with patience_with_bridge(plan, stall_timeout_s):
+                bridge.take(batch, copies)
+        finally:
+            recording.add(order.push(copies))
 
     time_ns = 0
     error: BaseException | None = None

@@ -21,8 +21,10 @@ class Bridge(ABC):
     """URLs of the buses, separated by commas"""
 
     @abstractmethod
-    def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Takes messages of the run in order of time; returns messages with the frames made of them, for recorders."""
+    def take(self, messages: Sequence[Message], copies: list[Message]) -> None:
+        """Takes messages of the run in order of time; adds messages with the frames made of them to `copies`, for recorders.
+
+        Raises PartRunError if a user's own protocol fails; the frames that were sent before are in `copies`."""
 
     @abstractmethod
     def stop(self) -> None:
@@ -49,8 +51,8 @@ class Bridge(ABC):
 class NoBridge(Bridge):
     """The bridge of a run without a bus."""
 
-    def take(self, messages: Sequence[Message]) -> list[Message]:
-        return []
+    def take(self, messages: Sequence[Message], copies: list[Message]) -> None:
+        pass
 
     def stop(self) -> None:
         pass

@@ -60,15 +60,14 @@ class ClosedBridge(Bridge):
         if self.buses and paired:
             self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.log)
 
-    def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Shows the frames of its own role on the buses.  Returns no messages: recorders get those of the role."""
+    def take(self, messages: Sequence[Message], copies: list[Message]) -> None:
+        """Shows the frames of its own role on the buses.  Adds no copies: recorders get the messages of the role."""
         for message in messages:
             if message.channel is Channel.FRAMES and message.source == self.index:
                 frames = frames_of(message)
                 if self.buses:
                     self.rail.put(frames)
                 self.log(frames)
-        return []
 
     def log(self, frames: Sequence[TimedFrame]) -> None:
         """Writes frames to can.log."""

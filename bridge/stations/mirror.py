@@ -69,15 +69,21 @@ class MirrorBridge(Bridge):
         self._stop_ns: int | None = None
         """When the wheels were stopped"""
 
-    def take(self, messages: Sequence[Message]) -> list[Message]:
-        """Sends the torques in the robots' states; returns messages with the frames: one per instant, or one on a wall clock.
+    def take(self, messages: Sequence[Message], copies: list[Message]) -> None:
+        """Sends the torques in the robots' states; adds messages with the frames: one per instant, or one on a wall clock.
 
         The state at run time 0 holds no torque.  So a robot's first frame comes at the end of its first period.
         """
-        copies: list[Message] = []
         if self._stopped:
-            return copies
+            return
         words: list[int] = []
+        try:
+            self._send(messages, words, copies)
+        finally:  # a user's protocol may fail; what was sent before is recorded
+            self._copy(words, copies)
+
+    def _send(self, messages: Sequence[Message], words: list[int], copies: list[Message]) -> None:
+        """Sends the frames of some states, and adds them to `words`, those of past instants to `copies`."""
         buses, names, log, encode, clock = self._buses, self._names, self._log, self._mirror.encode, self.clock
         wall_ns = time.monotonic_ns()
         for channel, source, _, time_ns, values in messages:
@@ -103,8 +109,6 @@ class MirrorBridge(Bridge):
                     continue
                 log.write(sent_ns, identifier, data, wall_ns, names[number])
                 add_words(words, sent_ns, number, BRIDGE_NODE, identifier, data)
-        self._copy(words, copies)
-        return copies
 
     def stop(self) -> None:
         """Takes the torque away from the wheels and disables their drives: drives on the bus obey mirrored frames, too.

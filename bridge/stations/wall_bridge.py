@@ -125,9 +125,8 @@ class WallBridge(Bridge):
         found = [one for one in self._role.robots if one.host.fault and one.robot.drive.recover_ns is None]
         return ", ".join(f"{one.robot.name}: {one.host.fault}" for one in found)
 
-    def take(self, messages: Sequence[Message]) -> list[Message]:
+    def take(self, messages: Sequence[Message], copies: list[Message]) -> None:
         """Does nothing, since torques come through `mail`."""
-        return []
 
     def _torques(self) -> None:
         """Takes the robots' torques from `mail`, applies loss and delay of their links, and sends those that have arrived."""

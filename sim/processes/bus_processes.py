@@ -73,11 +73,12 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
         bridge.clock = RunClock(start_ns)
 
     def take(messages: list[Message]) -> None:
+        copies: list[Message] = []
         try:
-            frames = [encode(message) for message in bridge.take(messages)]
+            bridge.take(messages, copies)
         except PartRunError as error:
             end(error)
-            return
+        frames = [encode(message) for message in copies]
         for at in range(0, len(frames), BATCH):
             publisher.put(join(frames[at : at + BATCH]))
 

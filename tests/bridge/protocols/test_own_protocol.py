@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from echelon.bridge.can.log_files import frames_in
 from echelon.bridge.protocols.frame import Frame
@@ -149,16 +150,28 @@ def test_on_a_wall_clock_wheels_are_stopped_first_too(folder: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("clock", ["virtual", "wall"])
-def test_a_mirroring_bridge_reports_a_failure_and_its_counts(folder: Path, tmp_path: Path, clock: str) -> None:
-    old, new = failing("mirror", "raise KeyError('w')")
-    new = new.replace("arguments[0] > 300_000_000", "arguments[0] > 0.0")  # a torque, not a time
-    scenario = changed(folder, (old, new))
+@pytest.mark.parametrize(
+    ("engine", "clock"), [("processes", "virtual"), ("processes", "wall"), ("inprocess", "virtual")]
+)
+def test_a_mirroring_bridge_reports_a_failure_its_counts_and_all_frames_that_it_sent(
+    folder: Path, tmp_path: Path, engine: str, clock: str
+) -> None:
+    owner = "class MyHost(CyclicHost):"
+    fails = (
+        f"{owner}\n    said = 0\n\n    def mirror(self, *arguments):\n"
+        "        self.said += self.plan.node_ids[0] == 1\n"
+        "        if self.said > 30 and any(arguments[:2]): raise KeyError('w')\n"
+        "        return super().mirror(*arguments)\n"
+    )
+    scenario, run = changed(folder, (owner, fails)), tmp_path / "run"
     sets = ("--set", "can.path=mirror", "--set", "claims=[]", "--can", "virtual", "--clock", clock)
-    done = echelon("run", scenario, *sets, *QUIET, "--out", tmp_path / "run")
+    done = echelon("run", scenario, *sets, "--engine", engine, *QUIET, "--out", run)
     assert done.returncode == 3
     assert "its host's mirror raised KeyError: 'w'" in done.stderr
-    the_bridge_has_reported(tmp_path / "run")
+    the_bridge_has_reported(run)
+    with (run / "run.mcap").open("rb") as file:
+        recorded = sum(1 for _ in make_reader(file).iter_messages(topics=["/can/frames"]))
+    assert recorded == summary_of(run)["can"]["frames"] > 30
 
 
 def test_a_host_that_cannot_even_stop_is_made_to_ask_for_no_torque(folder: Path) -> None:

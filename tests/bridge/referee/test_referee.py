@@ -100,7 +100,7 @@ def test_nothing_is_found_without_bits_or_without_drives(protocol: str, timing: 
     else:
         plan = plan_of("lab", "duration=1", "claims=[]", f"robot.drive.protocol={protocol}")
         station = MirrorBridge(plan, ["virtual:referee"], tmp_path)
-        Engine(plan, lambda message: station.take([message]).clear()).run()
+        Engine(plan, lambda message: station.take([message], [])).run()
         station.close()
         summary = judge_log(tmp_path / "can.log", plan)
         assert len(summary.identifiers) == (9 if protocol == "native" else 18)

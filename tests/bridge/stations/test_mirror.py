@@ -31,11 +31,11 @@ def test_the_first_torque_that_a_bus_takes_after_a_stop_is_zero(
     plan = plan_of("lab", "claims=[]", "can.watchdog=1000.0")
     bridge = MirrorBridge(plan, ["virtual:mirror"], tmp_path, RunClock())
     with closing(bridge):
-        bridge.take([state(1, 0.5), state(2, math.nan)])
+        bridge.take([state(1, 0.5), state(2, math.nan)], [])
         with monkeypatch.context() as full:
             full.setattr(Bus, "send", lambda *_: False)
-            bridge.take([state(3, 0.5)])  # the frame that enables with zero torque is lost
-        bridge.take([state(4, 0.5), state(5, 0.5)])
+            bridge.take([state(3, 0.5)], [])  # the frame that enables with zero torque is lost
+        bridge.take([state(4, 0.5), state(5, 0.5)], [])
     said = [NativeCodec(0.001).decode(frame.can_id, frame.data) for _, _, frame in frames_in(tmp_path / "can.log")]
     torques = [(one.enable_right, one.tau_right) for one in said if isinstance(one, Torque)]
     assert torques == [(True, 0.5), (False, 0.0), (True, 0.0), (True, 0.5)]

@@ -106,6 +106,7 @@ def run_mirror_bridge(spec: ProcessSpec, session: Session, control: Connection, 
                 tell(control, bridge.progress())
             order = hear_finish(control)
         for messages in reception.drain(order.robot_messages):
+            watch.pulse.at_work(PROGRESS_S)
             take(messages)
         end()
     finally:

@@ -82,12 +82,13 @@ def finish_watchers(
     failure: str | None,
     whole: bool,
     asked: Callable[[], bool] = lambda: False,
+    stalled: Callable[[Child], str | None] = lambda child: None,
 ) -> str | None:
     """Lets bridge, drives, referee and recorder finish, in this order; returns the failure of the run, old or new.
 
     If a run is `whole`, every message that was sent arrives, and watchers wait for all of them.  In other runs messages may be
     lost, and watchers wait until it is silent.  `say` shows a note to the user.  Once the user has `asked` for the end, each
-    watcher has `GRACE_S`."""
+    watcher has `GRACE_S`.  `stalled` returns in words that a process has stood still for too long, or None."""
     links = tuple(counts for child in children if child.done for counts in child.done.links)
     stopped_ns: int | None = None
     sent = {"robot": 0, "leader": 0, "coordinator": 0, "bridge": 0, "drives": 0}
@@ -105,7 +106,7 @@ def finish_watchers(
                 messages=sum(sent.values()) if told else None,
                 wheels_stopped_ns=stopped_ns,
             )
-            failure = _finish(child, order, serve, say, failure, asked)
+            failure = _finish(child, order, serve, say, failure, asked, stalled)
             if child.done is not None and isinstance(child.done.report, CanReport):
                 sent["bridge"] = child.done.report.messages
                 stop_s = child.done.report.wheels_stopped
@@ -129,11 +130,13 @@ def _finish(
     say: Callable[[str], None],
     failure: str | None,
     asked: Callable[[], bool],
+    stalled: Callable[[Child], str | None],
 ) -> str | None:
     """Sends the order to finish to a process and waits until it is done; returns the failure of the run, old or new.
 
     One that somebody has stopped goes on once more, so that it keeps what has come to it: at once if the run has failed, else
-    after `GRACE_S`, and then the run has failed.  What has not finished `GRACE_S` later is given up."""
+    after `GRACE_S`, and then the run has failed.  What has not finished `GRACE_S` later is given up, and so is one that runs a
+    user's part and has `stalled`; a bridge then stops the wheels first."""
     try:
         child.control.send(order)
     except OSError:
@@ -151,6 +154,10 @@ def _finish(
             failure = failure or str(LostError(child))
             child.signal(signal.SIGCONT)
             begun_s, continued = time.monotonic(), True
+        elif child.runs() and (why := stalled(child)):
+            failure = failure or why
+            stop_wheels([child], serve)
+            break
         elif waited_s > (GRACE_S if failure or asked() or stopped else FINISH_TIMEOUT_S):
             break
     return failure or (str(LostError(child)) if child.done is None else None)

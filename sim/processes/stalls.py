@@ -121,6 +121,13 @@ class StallWatch:
         if still_s > self._stall_timeout_s:
             raise StallError(still_s, self._who_is_waited_for(now_s))
 
+    def stands_still(self, child: Child) -> str | None:
+        """Returns in words that a process has stood still for the stall timeout, by its pulse; None if it has not."""
+        still_s = child.pulse.overdue_ns(time.monotonic_ns()) / 1e9
+        if still_s <= self._stall_timeout_s:
+            return None
+        return StallError(still_s, _waited_for([child])).text(f"t = {self._progress.time_ns / 1e9:g} s")
+
     def _watchers_late_by(self, late_s: float, now_s: float) -> list[Child]:
         """Returns the watchers that are late by some time, by their pulses."""
         then_ns = round((now_s - late_s) * 1e9)
@@ -149,9 +156,7 @@ class StallWatch:
         ]
         silent = silent or [child for child in self._children if child.state() == "stopped"]
         if silent:
-            return "everyone waits for " + few(
-                [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in silent]
-            )
+            return _waited_for(silent)
         members = self._plan.all_roles
         waits = [
             f"{child.name} for {few([members[source].name for source in child.waiting_for])}"
@@ -159,6 +164,13 @@ class StallWatch:
             if child.waiting_for
         ]
         return "all wait: " + few(waits, "; ")
+
+
+def _waited_for(children: Sequence[Child]) -> str:
+    """Returns in words that everyone waits for some processes."""
+    return "everyone waits for " + few(
+        [f"{child.name} (process {child.process.pid}, {child.state()}{child.runs()})" for child in children]
+    )
 
 
 def _waits(child: Child, now_s: float) -> bool:

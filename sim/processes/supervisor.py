@@ -157,7 +157,13 @@ class Supervisor:
                 self.progress.phase = "finishing"
             whole = self.virtual and not broken  # on a wall clock, messages may be lost on the way
             failure = finish_watchers(
-                self._children, self._hearing.serve, self._say, failure, whole, lambda: self._interruption.asked
+                self._children,
+                self._hearing.serve,
+                self._say,
+                failure,
+                whole,
+                lambda: self._interruption.asked,
+                self._stalls.stands_still,
             )
         except BaseException as other:
             error = error or other

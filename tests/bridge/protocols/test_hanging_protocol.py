@@ -62,6 +62,7 @@ def test_one_that_hangs_at_once_is_found_before_a_run(tmp_path: Path, monkeypatc
         ("drives", "inprocess"),
         ("drives", "processes"),
         ("mirror", "inprocess"),
+        ("mirror", "processes"),
     ],
 )
 def test_one_that_hangs_in_a_run_is_named_and_nothing_is_lost(tmp_path: Path, part: str, engine: str) -> None:

@@ -164,12 +164,14 @@ def _override(table: dict[str, Any], override: str) -> str:
             at = at.setdefault(chunk, empty)
         else:
             break
-    last = chunks[-1]
+    last, value = chunks[-1], value_of(text)
+    if value == text.strip() and value[:1] in tuple("\"'[{"):
+        raise OverrideError(f"{short(value)} begins as TOML, but is none; is a quote or a bracket missing?")
     if isinstance(at, list):
         index = _index(at, last)
-        at[index : index + 1] = [value_of(text)]
+        at[index : index + 1] = [value]
     elif isinstance(at, dict):
-        at[last] = value_of(text)
+        at[last] = value
     else:
         raise OverrideError(f"{short(last)} would stand in a value, not in a table")
     return key_text(chunks)

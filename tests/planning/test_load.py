@@ -256,6 +256,13 @@ def test_overrides_are_applied_in_order(overrides, value):
     assert parse(BASE, "t.toml", overrides)[0].law.epsilon == value
 
 
+@pytest.mark.parametrize("text", ['"new', "'new", "[0.1, 0.2", "{delay=0.1", "[0.1 0.2]", "'a' 'b'"])
+def test_an_override_that_begins_as_toml_and_is_none_is_refused(text):
+    assert said(BASE, f"name={text}") == (
+        f"t.toml with --set name={text}: {text} begins as TOML, but is none; is a quote or a bracket missing?"
+    )
+
+
 def test_overrides_make_the_tables_and_arrays_they_need():
     scenario, _ = parse(
         BASE, "t.toml", ["links.0.loss=0.5", "links.1.delay.min=0", "links.1.delay.max=0.1", "name=new_name"]

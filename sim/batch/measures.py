@@ -58,10 +58,7 @@ def measure(
     for number in range(len(nodes)):
         node = nodes[number]
         count, z = node.count, node.f_pot_at
-        for child in range(count):
-            place = places + 2 * index[node.children_at + child]
-            real[node.a_at + 2 * child], real[node.a_at + 2 * child + 1] = real[place], real[place + 1]
-        to_shape(node, 2, table, real, node.a_at, z)
+        to_shape(node, 2, table, real, _side_by_side(node, index, real, places), z)
         centroid = places + 2 * (len(robots) + number)
         real[centroid], real[centroid + 1] = real[z + 2 * (count - 1)], real[z + 2 * (count - 1) + 1]
         square = 0.0
@@ -83,6 +80,17 @@ def measure(
 
 
 @fused
+def _side_by_side(node: Any, index: Any, real: Any, values: int) -> int:
+    """Returns where the values of a node's children are side by side, two each; `values`: those of all roles."""
+    if node.first_child >= 0:
+        return int(values + 2 * node.first_child)
+    for child in range(node.count):
+        place = values + 2 * index[node.children_at + child]
+        real[node.a_at + 2 * child], real[node.a_at + 2 * child + 1] = real[place], real[place + 1]
+    return int(node.a_at)
+
+
+@fused
 def _note_rates(run: Any, robots: Any, real: Any) -> None:
     """Notes the robots' velocities."""
     for robot in range(len(robots)):
@@ -99,10 +107,7 @@ def _note_amplitudes(
     """Adds the squared amplitude of a node's blocks to the sum of its sixth (sim.results.ending).  z of the node is known,
     and so is |e|² of its shape, `square`.  The velocity of its centroid goes to `own`."""
     count, z, rates = node.count, node.f_pot_at, node.eta_at
-    for child in range(count):
-        place = run.rates_at + 2 * index[node.children_at + child]
-        real[node.a_at + 2 * child], real[node.a_at + 2 * child + 1] = real[place], real[place + 1]
-    to_shape(node, 2, table, real, node.a_at, rates)
+    to_shape(node, 2, table, real, _side_by_side(node, index, real, run.rates_at), rates)
     centroid = 2 * (count - 1)
     real[own], real[own + 1] = real[rates + centroid], real[rates + centroid + 1]
     sixth = M_SOONER + (time_ns >= run.earlier_ns) + (time_ns >= run.last_ns)

@@ -81,7 +81,7 @@ class ModelMaker:
 
     def _node(self, node: NodePlan) -> dict[str, Any]:
         plan, pools, layout = self.plan, self.pools, NodeLayout.of(self.plan, node)
-        count, state, mine = len(node.children), layout.state, layout.mine
+        count, first, state, mine = len(node.children), node.children[0], layout.state, layout.mine
         kinds = [Channel.STATE if child < len(plan.robots) else Channel.GROUP_STATE for child in node.children]
         links = [
             self.of_links.numbers[child, node.index, kind] for child, kind in zip(node.children, kinds, strict=True)
@@ -96,6 +96,7 @@ class ModelMaker:
             "robots": node.robots,
             "links_at": pools.index(links),
             "children_at": pools.index(node.children),
+            "first_child": first if list(node.children) == [*range(first, first + count)] else -1,
             "shares_at": pools.table(
                 [w / total for w, total in zip(node.weights, accumulate(node.weights), strict=True)]
             ),

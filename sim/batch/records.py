@@ -45,10 +45,10 @@ ROBOT: Final = _record(
 )
 NODE: Final = _record(
     # whether it waits for its inputs; number of children and of robots below; in `table` w_k/(w_1 + … + w_k) and 1/w_k of each
-    # child k; in `indices` links from the children, their indices, the bounds of their robots, each robot's child, and what of
-    # their messages is carried up
-    "period_ns parent_period_ns when_heard count robots shares_at means_at links_at children_at bounds_at child_of_at "
-    "carried_at "
+    # child k; in `indices` links from the children, their indices (and the first, if each is one more than the one before, else
+    # -1), the bounds of their robots, each robot's child, and what of their messages is carried up
+    "period_ns parent_period_ns when_heard count robots shares_at means_at links_at children_at first_child bounds_at "
+    "child_of_at carried_at "
     # streams that it sends, the link from its parent, and places in its parent's REFERENCE
     "up reference command link acceleration parent_rates parent_forces "
     # its block, and its desired shape in `table`; scratch: s, e, acceleration of its centroid, η, accelerations, F_pot, forces,

@@ -11,7 +11,7 @@ torque away must not be stopped by them.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from inspect import get_annotations
 from math import isfinite
 from typing import Any, Self
@@ -34,6 +34,8 @@ class Caller:
 
     def __init__(self, part: Part[Any], whom: str, allowed: frozenset[int]) -> None:
         self.part, self.whom, self.allowed = part, whom, allowed
+        self.busy = False
+        """True while a call goes on"""
 
     @classmethod
     def of(cls, robot: RobotPlan) -> Self:
@@ -51,6 +53,7 @@ class Caller:
         """Calls a function and returns its result; `what` names the function in errors.
 
         If that function is a method of a base class, the error names the method of the protocol that it called."""
+        self.busy = True
         try:
             return function(*arguments)
         except PART_ERRORS as error:
@@ -58,6 +61,8 @@ class Caller:
             if s and (calls := self.part.calls_in(error)):
                 what = f"{whose}{s}{calls[0][0]}"
             raise self.part.raised(self.whom, what, error) from error
+        finally:
+            self.busy = False
 
     def make(self, what: str, interface: type, function: Callable[..., Any], *arguments: Any) -> Any:
         """Calls a function that makes an object, and returns it if it has all attributes of an interface."""
@@ -113,6 +118,11 @@ class CheckedHost:
         self.enabled, self.fault, self.torque, self.clipped = False, "", (0.0, 0.0), 0
         self.torque_ns: int | None = None
         self._read("host")
+
+    @property
+    def busy(self) -> bool:
+        """True while a call goes on: seen from another thread, the host may hang."""
+        return self._caller.busy
 
     def poll(self, time_ns: int) -> list[Frame]:
         """Returns all due frames except torques."""
@@ -267,6 +277,16 @@ class CheckedMaster:
         if frame is not None:
             self._caller.check("its master's sync", frame)
         return frame
+
+
+def those_at_rest_first(hosts: Iterable[tuple[int, Host]]) -> list[list[int]]:
+    """Returns the numbers of hosts in up to two groups: those at rest, then those in the middle of a call.
+
+    To stop wheels they are asked in this order: one that hangs keeps no other from being stopped."""
+    rest, busy = list[int](), list[int]()
+    for number, host in hosts:
+        (busy if isinstance(host, CheckedHost) and host.busy else rest).append(number)
+    return [group for group in (rest, busy) if group]
 
 
 def _is_finite(number: Any) -> bool:

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from echelon.bridge.frame_message import BACK, BRIDGE_NODE, EMPTIED, NO_BUS, OFF, TimedFrame, pack, unpack
+from echelon.bridge.protocols.checked import those_at_rest_first
 from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.protocols.registry import drive_places, make_host, make_masters
 from echelon.bridge.reports import WheelsReport
@@ -101,15 +102,17 @@ class RobotChannel:
             return 0.0, 0.0
         return self.host.torque
 
-    def stop(self, time_ns: int) -> tuple[list[Frame], str]:
-        """Returns frames that take the torque away and disable the drives, and a text that says what failed.
+    def stop(self, time_ns: int) -> tuple[list[Frame], BaseException | None]:
+        """Returns frames that take the torque away and disable the drives, and what failed.
 
-        If a host fails at `stop`, the frames only command zero torque; if `mirror` fails, too, there are none.  The text is
-        empty if nothing failed.  Nothing is raised: the other robots must be stopped, too."""
+        If a host fails at `stop`, the frames only command zero torque; if `mirror` fails, too, there are none.  Nothing is
+        raised: the other robots must be stopped, too."""
         try:
-            return self.host.stop(time_ns), ""
+            return self.host.stop(time_ns), None
         except Exception as error:
-            failure = str(error) if isinstance(error, PartRunError) else f"{type(error).__name__}: {error}"
+            failure = error if isinstance(error, PartRunError) else PartRunError(f"{type(error).__name__}: {error}")
+        except BaseException as error:  # of a time limit, for a host that hangs: it is asked nothing more
+            return [], error
         try:
             return self.host.mirror(0.0, 0.0, False), failure
         except Exception:
@@ -257,11 +260,19 @@ class Commander:
         for frame in frames:
             self.buses[bus].send(time_ns, BRIDGE_NODE, frame)  # the model counts a frame that finds its queue full
 
-    def stop(self, time_ns: int) -> tuple[list[TimedFrame], str]:
-        """Returns frames that take the torque away from all wheels and disable their drives, and the first failure's text."""
-        stopped = [(robot.robot.drive.bus, robot.stop(time_ns)) for robot in self.robots]
-        frames = [TimedFrame(time_ns, bus, BRIDGE_NODE, frame) for bus, (of_robot, _) in stopped for frame in of_robot]
-        return frames, next((failure for _, (_, failure) in stopped if failure), "")
+    def in_order_of_stopping(self) -> list[list[int]]:
+        """Returns the numbers of the robots, in the groups in which they are to be stopped (`those_at_rest_first`)."""
+        return those_at_rest_first((number, robot.host) for number, robot in enumerate(self.robots))
+
+    def stop(self, time_ns: int, robots: Sequence[int]) -> tuple[list[TimedFrame], BaseException | None]:
+        """Returns frames that take the torque away from the wheels of some robots and disable their drives, and what failed
+        first."""
+        frames, failure = list[TimedFrame](), None
+        for robot in (self.robots[number] for number in robots):
+            made, failed = robot.stop(time_ns)
+            frames += [TimedFrame(time_ns, robot.robot.drive.bus, BRIDGE_NODE, frame) for frame in made]
+            failure = failure or failed
+        return frames, failure
 
     def apply_events(self, time_ns: int) -> list[tuple[int, list[Frame]]]:
         """Applies the scenario's e-stops and disturbances of this instant; returns the frames of e-stops, each with its bus."""

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from echelon.bridge.protocols.checked import those_at_rest_first
 from echelon.bridge.protocols.frame import Frame, Host
 from echelon.bridge.reports import WheelsReport
 from echelon.bridge.roles.envelope import Envelope
@@ -129,18 +130,21 @@ class TorqueMirror:
         """Says that a bus did not take a robot's last frames: its drives may be disabled still."""
         self._zero_first[robot] = True
 
-    def end(self) -> tuple[list[tuple[int, Frame]], BaseException | None]:
-        """Returns the frames that stop the drives of all robots that had torques, each with the number of its robot, and what a
-        host raised, if one has failed: the other robots are stopped all the same.
+    def driven(self) -> list[list[int]]:
+        """Returns the robots that had torques, in the groups in which they are to be stopped (`those_at_rest_first`)."""
+        return those_at_rest_first((robot, host) for robot, host in enumerate(self._hosts) if self.counts[robot].frames)
+
+    def end(self, robots: Sequence[int]) -> tuple[list[tuple[int, Frame]], BaseException | None]:
+        """Returns the frames that stop the drives of some robots, each with the number of its robot, and what a host raised, if
+        one has failed: the other robots are stopped all the same.
 
         The frames are not counted, since no state has caused them."""
         frames, failure = list[tuple[int, Frame]](), None
-        for robot, counts in enumerate(self.counts):
-            if counts.frames:
-                try:
-                    frames += [(robot, frame) for frame in self._hosts[robot].mirror(0.0, 0.0, False)]
-                except BaseException as error:  # also of a time limit, for a host that hangs
-                    failure = failure or error
+        for robot in robots:
+            try:
+                frames += [(robot, frame) for frame in self._hosts[robot].mirror(0.0, 0.0, False)]
+            except BaseException as error:  # also of a time limit, for a host that hangs
+                failure = failure or error
         return frames, failure
 
     def _send(self, robot: int, frames: list[Frame]) -> list[Frame]:

@@ -1,7 +1,7 @@
 """The bridge on the closed torque path with its role, its buses, can.log and the DBC files."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +18,6 @@ from echelon.bridge.stations.rail import Rail, on_bus
 from echelon.bridge.stations.waiting import FLOOD
 from echelon.bridge.timing.buses import bus_report, scheduled
 from echelon.bridge.timing.fit import plan_fit
-from echelon.errors import PartRunError
 from echelon.files import write_new
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan
@@ -84,19 +83,24 @@ class ClosedBridge(Bridge):
         """Does the same as `stop`, at run time `time_ns`.  The frames do not wait in the models of the buses.
 
         Raises PartRunError afterwards if a user's own protocol failed at it."""
-        frames, failure = self.send_stop(time_ns)
-        self.log(frames)
-        if failure:
-            raise PartRunError(failure)
+        self.send_stop(time_ns, self.log)
 
-    def send_stop(self, time_ns: int) -> tuple[list[TimedFrame], str]:
-        """Sends the frames that stop all wheels, without any other work; returns those sent, and what failed in words.
+    def send_stop(self, time_ns: int, sent: Callable[[list[TimedFrame]], None]) -> None:
+        """Sends the frames that stop all wheels; then calls `sent` with those that a bus took.  If a host hangs, it is asked
+        last, after `sent` has got the frames of the others; they are in can.log then.
 
-        A bus that is full takes them within `STOP_S`, or not at all; then the drives' own watchdogs take the torque away."""
+        A bus that is full takes them within `STOP_S`, or not at all; then the drives' own watchdogs take the torque away.
+        Raises PartRunError afterwards if a user's own protocol failed at it."""
         self._robots = self.role.reports()
         self._stop_ns = time_ns
-        frames, failure = self.role.stop(time_ns)
-        return (send_all(self.buses, frames) if self.buses else frames), failure
+        failure: BaseException | None = None
+        for robots in self.role.in_order_of_stopping():
+            frames, failed = self.role.stop(time_ns, robots)
+            failure = failure or failed
+            sent(send_all(self.buses, frames) if self.buses else frames)
+            self._log.flush()
+        if failure is not None:
+            raise failure
 
     def interrupt(self) -> None:
         """Ends any waiting for a bus that accepts no frames."""

@@ -113,25 +113,24 @@ class MirrorBridge(Bridge):
     def stop(self) -> None:
         """Takes the torque away from the wheels and disables their drives: drives on the bus obey mirrored frames, too.
 
-        After that nothing is sent any more.  If a host raised something, raises it after all others are stopped."""
+        After that nothing is sent any more.  If a host raised something, raises it after all others are stopped.  One that
+        hangs is asked last, when the frames of the others are on the bus and in can.log."""
         self._stopped = True
         now_ns = None if self.clock is None else self.clock.now()
-        stops, failure = self._mirror.end()
-        frames = [
-            # in virtual time each is due when the robot's next one would be
-            TimedFrame(
-                self._time_ns + self._plan.robots[robot].period_ns if now_ns is None else now_ns,
-                self._bus_of[robot],
-                BRIDGE_NODE,
-                frame,
-            )
-            for robot, frame in stops
-        ]
-        frames.sort(key=lambda timed: timed.time_ns)
-        self._stop_ns = frames[0].time_ns if frames else self._time_ns + 1
-        wall_ns = time.monotonic_ns()
-        for time_ns, bus, _, (can_id, data, remote) in send_all(self._buses, frames):
-            self._log.write(time_ns, can_id, data, wall_ns, self._names[bus], remote)
+        groups = self._mirror.driven()
+        # in virtual time each stop is due when the robot's next frame would be
+        due_ns = [self._time_ns + robot.period_ns if now_ns is None else now_ns for robot in self._plan.robots]
+        self._stop_ns = min((due_ns[robot] for group in groups for robot in group), default=self._time_ns + 1)
+        failure: BaseException | None = None
+        for group in groups:
+            stops, failed = self._mirror.end(group)
+            failure = failure or failed
+            frames = [TimedFrame(due_ns[robot], self._bus_of[robot], BRIDGE_NODE, frame) for robot, frame in stops]
+            frames.sort(key=lambda timed: timed.time_ns)
+            wall_ns = time.monotonic_ns()
+            for time_ns, bus, _, (can_id, data, remote) in send_all(self._buses, frames):
+                self._log.write(time_ns, can_id, data, wall_ns, self._names[bus], remote)
+            self._log.flush()
         if failure is not None:
             raise failure
 

@@ -24,7 +24,6 @@ from echelon.bridge.stations.guarding import check_sender, look
 from echelon.bridge.stations.paced_bus import PacedBus
 from echelon.bridge.stations.waiting import AT_ONCE, Mail, RunClock, drained
 from echelon.bridge.timing.bus_load import BitCount
-from echelon.errors import PartRunError
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan, on_wall_clock
 from echelon.runtime.fates import Fates
@@ -211,12 +210,13 @@ class WallBridge(Bridge):
         """Takes the torque away from all wheels and disables their drives."""
         now_ns = self.clock.now()
         self._stopped = True
-        frames, failure = self._closed.send_stop(now_ns)
-        self._frames_from_buses(now_ns)
-        self._flush()
-        self._closed.log(frames)
-        if failure:
-            raise PartRunError(failure)
+
+        def sent(frames: list[TimedFrame]) -> None:
+            self._frames_from_buses(now_ns)
+            self._flush()
+            self._closed.log(frames)
+
+        self._closed.send_stop(now_ns, sent)
 
     def close(self) -> None:
         """Closes log and buses, after a last look at what others sent."""

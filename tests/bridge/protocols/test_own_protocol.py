@@ -17,6 +17,7 @@ from echelon.planning.loading import ScenarioError
 from echelon.planning.loading import load as load_untried
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.parts.loading import REGISTRY, load
+from echelon.sim.parts.time_limit import TookTooLong
 from support.awkward import write_awkward_files
 from support.runs import EXAMPLES, echelon, reasons, summary_of
 
@@ -181,9 +182,28 @@ def test_a_host_that_cannot_even_stop_is_made_to_ask_for_no_torque(folder: Path)
     engine.run()
     commander = engine.commander
     assert commander is not None
-    frames, failure = commander.stop(plan.duration_ns)
+    frames, failure = commander.stop(plan.duration_ns, range(3))
     assert [timed.frame for timed in frames] == [Frame(0x300 + robot, bytes(5)) for robot in range(3)]
-    assert failure == "my_drive.py, line 54: MyProtocol of r1: its host's stop raised RuntimeError: no"
+    assert isinstance(failure, PartRunError)
+    assert str(failure) == "my_drive.py, line 54: MyProtocol of r1: its host's stop raised RuntimeError: no"
+
+
+def test_a_host_that_is_stopped_by_a_time_limit_keeps_no_other_robot_from_being_stopped(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, plan = load(folder / "my_drive.toml", ["duration=0.5", "claims=[]"])
+    engine = Engine(plan)
+    engine.run()
+    commander = engine.commander
+    assert commander is not None
+
+    def hangs(*_: object) -> list[Frame]:
+        raise TookTooLong("more than 10 s")
+
+    monkeypatch.setattr(commander.robots[1].host, "stop", hangs)
+    frames, failure = commander.stop(plan.duration_ns, range(3))
+    assert [timed.frame.can_id for timed in frames] == [0x300, 0x302]
+    assert isinstance(failure, TookTooLong)
 
 
 def first(plan: Plan) -> object:

@@ -449,7 +449,8 @@ def test_one_protocol_that_fails_at_stopping_does_not_keep_others_turning(
     monkeypatch.setattr(bridge.robots[1].host, "stop", fail)
     if mirror_fails:
         monkeypatch.setattr(bridge.robots[1].host, "mirror", fail)
-    frames, failure = bridge.stop(100 * MS)
+    (robots,) = bridge.in_order_of_stopping()
+    frames, failure = bridge.stop(100 * MS, robots)
     stopped = {timed.frame.can_id - 0x100 for timed in frames if timed.frame.data[:5] == bytes(5)}
     assert stopped == set(range(9)) - ({1} if mirror_fails else set())
-    assert "a fault of the protocol" in failure
+    assert "a fault of the protocol" in str(failure)

@@ -48,7 +48,8 @@ def test_a_host_that_fails_at_the_end_keeps_no_other_robot_from_being_stopped(mo
         raise PartRunError("mine.py: raised")
 
     monkeypatch.setattr(hosts[1], "mirror", fails)
-    frames, failure = mirror.end()
+    assert mirror.driven() == [[0, 1, 2]]
+    frames, failure = mirror.end([0, 1, 2])
     assert [robot for robot, _ in frames] == [0, 2]
     assert str(failure) == "mine.py: raised"
 

@@ -15,7 +15,7 @@ from echelon.bridge.roles.commander import Commander
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.guarding import intrusions, look, open_guarded
 from echelon.bridge.stations.rail import Rail, on_bus
-from echelon.bridge.stations.waiting import FLOOD
+from echelon.bridge.stations.waiting import FLOOD, last_to_send
 from echelon.bridge.timing.buses import bus_report, scheduled
 from echelon.bridge.timing.fit import plan_fit
 from echelon.files import write_new
@@ -64,9 +64,10 @@ class ClosedBridge(Bridge):
         for message in messages:
             if message.channel is Channel.FRAMES and message.source == self.index:
                 frames = frames_of(message)
-                if self.buses:
-                    self.rail.put(frames)
-                self.log(frames)
+                count = self.rail.put(frames) if self.buses else len(frames)
+                self.log(frames[:count])
+                if count < len(frames):
+                    raise SystemExit(0)
 
     def log(self, frames: Sequence[TimedFrame]) -> None:
         """Writes frames to can.log."""
@@ -94,11 +95,12 @@ class ClosedBridge(Bridge):
         self._robots = self.role.reports()
         self._stop_ns = time_ns
         failure: BaseException | None = None
-        for robots in self.role.in_order_of_stopping():
-            frames, failed = self.role.stop(time_ns, robots)
-            failure = failure or failed
-            sent(send_all(self.buses, frames) if self.buses else frames)
-            self._log.flush()
+        with last_to_send(self.rail.sending):
+            for robots in self.role.in_order_of_stopping():
+                frames, failed = self.role.stop(time_ns, robots)
+                failure = failure or failed
+                sent(send_all(self.buses, frames) if self.buses else frames)
+                self._log.flush()
         if failure is not None:
             raise failure
 

@@ -1,5 +1,6 @@
 """The bridge on the mirrored torque path: robots' states in; frames out on the bus, into can.log, and to the recorder."""
 
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from echelon.bridge.roles.torque_mirror import TorqueMirror
 from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.closed import send_all
 from echelon.bridge.stations.guarding import intrusions, look, open_guarded
-from echelon.bridge.stations.waiting import AT_ONCE, FLOOD, RunClock
+from echelon.bridge.stations.waiting import AT_ONCE, FLOOD, RunClock, last_to_send
 from echelon.bridge.timing.bus_load import bus_load
 from echelon.bridge.timing.buses import scheduled
 from echelon.bridge.timing.fit import plan_fit
@@ -65,6 +66,7 @@ class MirrorBridge(Bridge):
         self._source = len(plan.formation)
         self._sequence = 0
         self._time_ns = 0
+        self._sending = threading.RLock()
         self._stopped = False
         self._stop_ns: int | None = None
         """When the wheels were stopped"""
@@ -85,6 +87,7 @@ class MirrorBridge(Bridge):
     def _send(self, messages: Sequence[Message], words: list[int], copies: list[Message]) -> None:
         """Sends the frames of some states, and adds them to `words`, those of past instants to `copies`."""
         buses, names, log, encode, clock = self._buses, self._names, self._log, self._mirror.encode, self.clock
+        sending = self._sending
         wall_ns = time.monotonic_ns()
         for channel, source, _, time_ns, values in messages:
             if channel is not Channel.STATE or time_ns == 0:
@@ -102,13 +105,16 @@ class MirrorBridge(Bridge):
                 time_ns, source, float(values[TAU_RIGHT]), float(values[TAU_LEFT]), bool(values[SATURATED] > 0)
             )
             sent_ns = self._time_ns
-            for identifier, data, _ in frames:
-                if not buses[number].send(identifier, data, sent_ns) and clock is not None:
-                    self._lost[number] += 1
-                    self._mirror.unsent(source)
-                    continue
-                log.write(sent_ns, identifier, data, wall_ns, names[number])
-                add_words(words, sent_ns, number, BRIDGE_NODE, identifier, data)
+            with sending:
+                if self._stopped:
+                    return
+                for identifier, data, _ in frames:
+                    if not buses[number].send(identifier, data, sent_ns) and clock is not None:
+                        self._lost[number] += 1
+                        self._mirror.unsent(source)
+                        continue
+                    log.write(sent_ns, identifier, data, wall_ns, names[number])
+                    add_words(words, sent_ns, number, BRIDGE_NODE, identifier, data)
 
     def stop(self) -> None:
         """Takes the torque away from the wheels and disables their drives: drives on the bus obey mirrored frames, too.
@@ -116,6 +122,10 @@ class MirrorBridge(Bridge):
         After that nothing is sent any more.  If a host raised something, raises it after all others are stopped.  One that
         hangs is asked last, when the frames of the others are on the bus and in can.log."""
         self._stopped = True
+        with last_to_send(self._sending):
+            self._send_stop()
+
+    def _send_stop(self) -> None:
         now_ns = None if self.clock is None else self.clock.now()
         groups = self._mirror.driven()
         # in virtual time each stop is due when the robot's next frame would be

@@ -42,16 +42,21 @@ class Rail:
         self.waiting = ""
         """Why the run waits for a bus; empty if it does not"""
         self.stopping = threading.Event()
+        """Set when the station must stop: it waits for nothing, and its stages put no frames"""
+        self.sending = threading.RLock()
+        """Held while frames are put and written into can.log"""
 
-    def put(self, frames: Sequence[TimedFrame]) -> None:
-        """Puts frames on their buses; waits while a bus accepts none.  Raises SystemExit if `stopping` is set meanwhile."""
-        for time_ns, bus, _, (can_id, data, remote) in frames:
+    def put(self, frames: Sequence[TimedFrame]) -> int:
+        """Puts frames on their buses; waits while a bus accepts none.  Returns how many it has put: all, unless `stopping` is
+        set meanwhile."""
+        for number, (time_ns, bus, _, (can_id, data, remote)) in enumerate(frames):
             self.spoken[bus].add(can_id)
             while not self.buses[bus].send(can_id, data, time_ns, remote):
                 self.waiting = f"{self.buses[bus].url} takes no frames: {self.buses[bus].error}"
                 if self.stopping.wait(RETRY_S):
-                    raise SystemExit(0)
+                    return number
             self.waiting = ""
+        return len(frames)
 
     def expect(self, frames: Sequence[TimedFrame]) -> None:
         """Waits until the buses have carried these frames, in this order on each.  Raises BusError if one does not come, and
@@ -92,6 +97,18 @@ def on_bus(
     def own(timed: TimedFrame) -> bool:
         return (timed.node == BRIDGE_NODE) is is_bridge
 
+    def put(frames: list[TimedFrame]) -> None:
+        with rail.sending:
+            mine = [timed for timed in frames if own(timed)]
+            count = 0 if rail.stopping.is_set() else rail.put(mine)
+            if count == len(mine):
+                said(frames)
+                return
+            places = [at for at, timed in enumerate(frames) if own(timed)]
+            unsent = {*places[count:]}
+            said([timed for at, timed in enumerate(frames) if at not in unsent])
+        raise SystemExit(0)
+
     def wrapped(stage: Stage) -> Stage:
         def run(time_ns: int, heard: Sequence[Heard]) -> tuple[Message, ...]:
             for message in heard:
@@ -100,9 +117,7 @@ def on_bus(
             messages = stage.run(time_ns, heard)
             for message in messages:
                 if message.channel is Channel.FRAMES:
-                    frames = frames_of(message)
-                    rail.put([timed for timed in frames if own(timed)])
-                    said(frames)
+                    put(frames_of(message))
             return messages
 
         return replace(stage, run=run)

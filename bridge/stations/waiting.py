@@ -1,11 +1,13 @@
-"""Shared parts of bridge and drives on a wall clock: a mailbox for the robots' torques, reading from a bus, the clock of the
-run, and sleeping until something comes."""
+"""Shared parts of bridge and drives: a mailbox for the robots' torques, reading from a bus, the clock of a run, sleeping until
+something comes, and the lock of who sends."""
 
 import os
 import select
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
@@ -22,6 +24,8 @@ AT_ONCE: Final = 256
 FLOOD: Final = 100 * AT_ONCE
 """The same in virtual time, which waits: the frames that matter may be behind a flood"""
 
+LAST_S: Final = 0.5
+"""How long who stops the wheels waits for another thread that is sending [s]"""
 SET_NS: Final = 1_000_000
 """By how much the kernel's clock must have changed against the monotonic clock to count as set [ns]"""
 
@@ -130,3 +134,18 @@ def _epoch_of_monotonic_clock() -> int:
 def wait_for(sources: Sequence[Any], left_ns: int) -> None:
     """Sleeps until one of the sources is readable, or for `left_ns`, but not longer than `PROGRESS_NS`."""
     select.select(sources, (), (), min(max(left_ns, 0), PROGRESS_NS) * 1e-9)
+
+
+@contextmanager
+def last_to_send(sending: threading.RLock) -> Iterator[None]:
+    """The context in which a station sends the frames that stop the wheels, perhaps in another thread than that of its torques.
+
+    A station holds `sending` while it sends frames and writes them into can.log.  Whoever stops the wheels first says that
+    nothing else is to be sent, and then waits here until what is being sent is on the bus and in the log.  So no torque comes
+    after the frames that stop.  The wait has a limit, since a disk may block the other thread."""
+    locked = sending.acquire(timeout=LAST_S)
+    try:
+        yield
+    finally:
+        if locked:
+            sending.release()

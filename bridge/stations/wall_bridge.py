@@ -22,7 +22,7 @@ from echelon.bridge.stations.bridge import Bridge
 from echelon.bridge.stations.closed import ClosedBridge
 from echelon.bridge.stations.guarding import check_sender, look
 from echelon.bridge.stations.paced_bus import PacedBus
-from echelon.bridge.stations.waiting import AT_ONCE, Mail, RunClock, drained
+from echelon.bridge.stations.waiting import AT_ONCE, Mail, RunClock, drained, last_to_send
 from echelon.bridge.timing.bus_load import BitCount
 from echelon.messages import Channel, Message
 from echelon.plan.plan import Plan, on_wall_clock
@@ -53,6 +53,7 @@ class WallBridge(Bridge):
         self._closed = ClosedBridge(plan, urls, folder, paired=True, role=Commander(plan, alone=True))
         self.url = self._closed.url
         self._role = self._closed.role
+        self._sending = self._closed.rail.sending
         self._buses = [
             PacedBus(bus, model, plan.can.watchdog_ns)
             for bus, model in zip(self._closed.buses, self._role.buses, strict=True)
@@ -193,30 +194,33 @@ class WallBridge(Bridge):
 
     def _carry(self, now_ns: int) -> None:
         """Sends the frames that the buses can have carried by now; measures the latency of torques."""
-        if self._stopped:
-            return
-        for number, bus in enumerate(self._buses):
-            for queued_ns, _, _, frame in bus.run(now_ns):
-                self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
-                awaited = self._awaited.get((number, frame.can_id))
-                while awaited and awaited[0][0] < queued_ns:
-                    awaited.popleft()  # this frame was lost
-                if awaited and awaited[0][0] == queued_ns:
-                    latency_ns = now_ns - awaited.popleft()[1]
-                    self.latencies.append(latency_ns)
-                    self.in_time += latency_ns < self._period_ns
+        with self._sending:
+            for number, bus in enumerate([] if self._stopped else self._buses):
+                self._carry_on(now_ns, number, bus)
+
+    def _carry_on(self, now_ns: int, number: int, bus: PacedBus) -> None:
+        for queued_ns, _, _, frame in bus.run(now_ns):
+            self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
+            awaited = self._awaited.get((number, frame.can_id))
+            while awaited and awaited[0][0] < queued_ns:
+                awaited.popleft()  # this frame was lost
+            if awaited and awaited[0][0] == queued_ns:
+                latency_ns = now_ns - awaited.popleft()[1]
+                self.latencies.append(latency_ns)
+                self.in_time += latency_ns < self._period_ns
 
     def stop(self) -> None:
         """Takes the torque away from all wheels and disables their drives."""
-        now_ns = self.clock.now()
         self._stopped = True
+        with last_to_send(self._sending):
+            now_ns = self.clock.now()
 
-        def sent(frames: list[TimedFrame]) -> None:
-            self._frames_from_buses(now_ns)
-            self._flush()
-            self._closed.log(frames)
+            def sent(frames: list[TimedFrame]) -> None:
+                self._frames_from_buses(now_ns)
+                self._flush()
+                self._closed.log(frames)
 
-        self._closed.send_stop(now_ns, sent)
+            self._closed.send_stop(now_ns, sent)
 
     def close(self) -> None:
         """Closes log and buses, after a last look at what others sent."""
@@ -278,21 +282,22 @@ class WallBridge(Bridge):
         self._carry(now_ns)
 
     def _note(self, timed: TimedFrame) -> None:
-        self._frames.append(timed)
+        with self._sending:
+            self._frames.append(timed)
         self._bits[timed.bus].add(*timed.frame)
 
     def _flush(self) -> None:
         """Writes the frames of a period to can.log and sends them to recorders."""
-        if not self._frames:
-            return
-        # the log must be in order of time, but a time stamp may be older than a frame that is already logged
-        self._frames.sort(key=lambda timed: timed.time_ns)
-        self._frames = [timed._replace(time_ns=max(timed.time_ns, self._logged_ns)) for timed in self._frames]
-        self._logged_ns = self._frames[-1].time_ns
-        self._closed.log(self._frames)
-        if self._watch is not None:
-            at_ns = self._frames[-1].time_ns
-            message = Message(Channel.FRAMES, self._closed.index, self._messages, at_ns, pack(self._frames))
-            self._messages += 1
-            self._watch(join([encode(message)]))
-        self._frames = []
+        with self._sending:
+            if not self._frames:
+                return
+            # the log must be in order of time, but a time stamp may be older than a frame that is already logged
+            self._frames.sort(key=lambda timed: timed.time_ns)
+            frames = [timed._replace(time_ns=max(timed.time_ns, self._logged_ns)) for timed in self._frames]
+            self._frames = []
+            self._logged_ns = frames[-1].time_ns
+            self._closed.log(frames)
+            if self._watch is not None:
+                message = Message(Channel.FRAMES, self._closed.index, self._messages, self._logged_ns, pack(frames))
+                self._messages += 1
+                self._watch(join([encode(message)]))

@@ -15,20 +15,27 @@ TESTS: Final = Path(__file__).parent
 LONG: Final = (
     "test_vcan.py",
     "sim/processes/test_stopping_table.py",
-    "sim/processes/test_stopping.py",
+    "sim/parts/test_foreign_parts.py",
     "cli/test_cli.py",
     "sim/processes/test_supervisor.py",
-    "sim/parts/test_foreign_parts.py",
-    "cli/test_cli_help.py",
     "sim/batch/test_delay_boundary.py",
+    "cli/test_cli_help.py",
+    "sim/processes/test_stopping.py",
     "cli/test_analyse.py",
+    "chaos/test_chaos.py",
     "controller/test_largest_delay.py",
+    "sim/processes/test_closed_processes.py",
     "cli/test_cli_scenarios.py",
     "test_wheel.py",
-    "sim/processes/test_closed_processes.py",
+    "sim/test_notebook.py",
+    "sim/test_recovery.py",
+    "cli/test_sweep_command.py",
     "sim/sweep/test_sweep.py",
+    "cli/test_recordings.py",
+    "controller/test_linear_run.py",
+    "sim/test_diverged_runs.py",
 )
-"""Files of tests that take a minute and more, the longest first"""
+"""Files of tests that take 40 s and more, the longest first"""
 
 settings.register_profile("ci", derandomize=True, deadline=None, database=None)
 settings.load_profile("ci")

@@ -325,8 +325,8 @@ def test_what_has_no_folder_was_not_recorded() -> None:
 
 def test_an_analysis_is_that_of_the_command() -> None:
     links = [{"channel": "reference", "delay": 0.06}]
-    found = echelon.analyse("lab", {"links": links}, policies=True, runs=0)
-    done = command("analyse", "lab", "--set", f"links={toml_value(links)}", "--policies", "--runs", "0", "--json")
+    found = echelon.analyse("drives", {"links": links}, policies=True, runs=0)
+    done = command("analyse", "drives", "--set", f"links={toml_value(links)}", "--policies", "--runs", "0", "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(json_text(found)) == json.loads(done.stdout)
     assert found.settles

@@ -50,6 +50,9 @@ def until(condition: Callable[[], bool]) -> None:
 def bring_up(network: Any, node_id: int) -> Any:
     """Returns a master's node in OPERATION ENABLED; SYNC, heartbeat and cyclic target torques are being sent."""
     node = network.add_node(canopen.BaseNode402(node_id, EDS))
+    for what in ("RESET_FAULT", "SWITCH_OP_MODE", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE", "CHECK_TPDO"):
+        setattr(node, f"TIMEOUT_{what}", PATIENCE_S)  # the library's, below a second, are too short for a busy machine
+    node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
     node.nmt.state = "PRE-OPERATIONAL"
     assert node.sdo["device name"].raw == "echelon virtual drive"
     assert node.sdo[0x6076].raw == 800

@@ -19,6 +19,7 @@ from echelon.sim.finished_run import Run
 from echelon.sim.interruption import Interruption, interruption
 from echelon.sim.out_folder import REPORT, OutFolder, out_folder, run_files
 from echelon.sim.processes.children import warm_up
+from echelon.sim.processes.contract import EndsAt
 from echelon.sim.results.can_lines import some
 from echelon.sim.run import execute
 from echelon.sim.view.live import Display
@@ -40,8 +41,8 @@ class Launch:
     """Show no progress"""
     stall_timeout_s: float = 30.0
     """A run in virtual time that makes no progress for this time is given up [s]"""
-    keep_going: bool = False
-    """Go on when a robot's state is not finite"""
+    ends_at: EndsAt = EndsAt.DIVERGED
+    """Where the run ends before its duration is over"""
     replace: bool = False
     """Delete the run of another scenario that is in `out`"""
     real_bus: bool = False
@@ -107,7 +108,7 @@ def _run_in(
             can_urls=urls,
             display=display,
             stall_timeout_s=options.stall_timeout_s,
-            keep_going=options.keep_going,
+            ends_at=options.ends_at,
             observe=options.observe,
             interrupted=interrupted,
         )

@@ -18,6 +18,7 @@ from echelon.sim import run_folder
 from echelon.sim.finished_run import Run
 from echelon.sim.launch import Launch, launch
 from echelon.sim.parts import loading as parts
+from echelon.sim.processes.contract import EndsAt
 
 if TYPE_CHECKING:
     from echelon.sim.replay.difference import RunDifference
@@ -122,7 +123,7 @@ def run(
         real_bus=real_bus,
         report=report,
         quiet=quiet,
-        keep_going=keep_going,
+        ends_at=EndsAt.NOWHERE if keep_going else EndsAt.DIVERGED,
         replace=replace,
     )
     return launch(loaded.scenario, loaded.plan, options)

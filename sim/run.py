@@ -34,6 +34,7 @@ from echelon.sim.observing import TICKET
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
 from echelon.sim.parts.foreign_parts import patience_with_bridge, stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
+from echelon.sim.processes.contract import EndsAt
 from echelon.sim.processes.outcome import Outcome, Progress
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.processes.watchers import RunRecorder
@@ -62,7 +63,7 @@ def execute(
     can_urls: tuple[str, ...],
     display: Display,
     stall_timeout_s: float = 30.0,
-    keep_going: bool = False,
+    ends_at: EndsAt = EndsAt.DIVERGED,
     observe: bool = False,
     interrupted: Interruption | None = None,
 ) -> tuple[Summary, Trace]:
@@ -70,8 +71,8 @@ def execute(
 
     `plan` is the plan of `scenario`, `out` the locked folder.  `engine` is `processes` or `inprocess`, `clock` is `virtual` or
     `wall`.  `can_urls` has a URL for each bus, or none if the run makes no frames.  A run in virtual time without progress for
-    `stall_timeout_s` is given up, and one on a wall clock with a member that stands still for as long.  A run ends at the first
-    instant at which a robot has diverged, unless `keep_going` is True.  With `observe`, others can read the messages
+    `stall_timeout_s` is given up, and one on a wall clock with a member that stands still for as long.  `ends_at` says
+    where a run ends before its duration is over.  With `observe`, others can read the messages
     of a run as processes while it goes on.  `interrupted` notes the signals that ask the run to end; without it this function
     notes them itself.  A run that breaks off has its reason in the summary; its exception is not raised.
 
@@ -99,7 +100,7 @@ def execute(
         metadata["recorded every"] = f"{every_ns / 1e9:g}"
     metadata |= {package: version(package) for package in PACKAGES} | parts.metadata
     if engine == "inprocess":
-        recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files, keep_going)
+        recorder = partial(RunRecorder, folder, plan, toml, metadata, parts.files, ends_at)
         with interruption() if interrupted is None else nullcontext(interrupted) as noted, noted.during(Raises.NONE):
             outcome = _in_process(plan, folder, clock, can_urls, recorder, display, stall_timeout_s, noted)
     else:
@@ -114,7 +115,7 @@ def execute(
             part_files=parts.files,
             show=display.show,
             stall_timeout_s=stall_timeout_s,
-            keep_going=keep_going,
+            ends_at=ends_at,
             observe=observe,
             interrupted=interrupted,
             every_ns=every_ns,

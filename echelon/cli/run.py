@@ -8,6 +8,7 @@ from typing import Final, Literal
 from echelon.cli.options import Command, option
 from echelon.cli.shared import ScenarioOptions, seconds
 from echelon.sim.interruption import interruption
+from echelon.sim.processes.contract import EndsAt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +101,7 @@ def _run(options: RunOptions) -> int:
                 report=not options.no_report,
                 quiet=options.quiet,
                 stall_timeout_s=options.stall_timeout,
-                keep_going=options.keep_going,
+                ends_at=EndsAt.NOWHERE if options.keep_going else EndsAt.DIVERGED,
                 replace=options.replace,
                 real_bus=options.real_bus,
                 observe=options.observe,

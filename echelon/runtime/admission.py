@@ -30,6 +30,7 @@ from math import hypot
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echelon.messages import NULL, Channel, Message, Values
 from echelon.plan.can_plan import NEVER_NS
@@ -204,3 +205,10 @@ def within(values: Values) -> bool:
     if values.size <= _FEW:
         return hypot(*values.tolist()) <= LARGEST  # false for NaN
     return bool(_product(values, values) <= _LARGEST_SQUARE)  # a sum may overflow
+
+
+def rows_within(rows: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns for each row of values, (…, n), what `within` says of it, (…)."""
+    with np.errstate(all="ignore"):  # a sum may overflow
+        found: NDArray[np.bool_] = np.einsum("...n,...n->...", rows, rows) <= _LARGEST_SQUARE
+    return found

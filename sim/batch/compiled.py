@@ -21,7 +21,7 @@ import numba
 from echelon.agents import plant, torque_loop
 from echelon.controller.laws import terminal_sliding
 from echelon.plan import delay_tables
-from echelon.runtime import ages, fates
+from echelon.runtime import admission, ages, fates
 
 _compiler: Any = numba  # without types: what there is of them changes from version to version
 P = ParamSpec("P")
@@ -68,7 +68,7 @@ def is_kept() -> bool:
 
 def sources() -> list[Path]:
     """Returns the sources of the compiled code: this room, and modules whose numbers are compiled into it."""
-    modules = plant, torque_loop, terminal_sliding, delay_tables, ages, fates
+    modules = plant, torque_loop, terminal_sliding, delay_tables, admission, ages, fates
     return [*sorted(Path(__file__).parent.glob("*.py")), *(Path(module.__file__ or "") for module in modules)]
 
 

@@ -44,8 +44,9 @@ class BatchRuns:
 
     plan: Plan
     runs: Records
-    """(R,): `seed`; `diverged`, when a robot's state was not finite [s], NaN if never; `smallest` distance of two robots [m],
-    their `pair` of indices and its `closest_time` [s]; number of `violations` of the avoidance radius"""
+    """(R,): `seed`; `diverged`, when a robot's state was not finite or beyond all bounds [s], NaN if never;
+    `smallest` distance of two robots [m], their `pair` of indices and its `closest_time` [s]; number of `violations` of the
+    avoidance radius"""
     blocks: Records
     """(R, blocks): as in `sim.results.records.BlockResult`; root mean squares of the amplitude in the last three sixths of the
     run [m]: `sooner`, `earlier` and `level` (`sim.results.ending.levels`)"""

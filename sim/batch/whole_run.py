@@ -3,6 +3,7 @@
 from math import cos, inf, isfinite, sin
 from typing import Any, Final
 
+from echelon.runtime.admission import LARGEST
 from echelon.sim.batch.compiled import compiled, is_kept
 from echelon.sim.batch.late_states import begin_commands
 from echelon.sim.batch.measures import measure
@@ -38,6 +39,7 @@ from echelon.sim.batch.records import (
 )
 from echelon.sim.batch.streams import change_ns, finish, hear, room, say, take_up
 
+_LARGEST_SQUARE: Final = LARGEST * LARGEST
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
 
@@ -46,8 +48,8 @@ __all__ = ["is_kept", "many_runs", "whole_run"]
 
 @compiled
 def whole_run(model: Any, keys: Any, real: Any, whole: Any, trace: Any, sums: Any) -> int:
-    """Runs a plan; returns the instant at which a robot's state is not finite [ns], or -1.  What is measured is in `real` and
-    `whole` then.
+    """Runs a plan; returns the instant at which a robot's state is not finite or out of bounds [ns], or -1.  What is
+    measured is in `real` and `whole` then.
 
     `keys`: two Philox keys of each link, (links, 4), the bits of its words as integers.  `trace`: states of the robots at the
     instants that all share, (T, robots, 7), or (0, robots, 7) if they are not wanted.  `sums`: |e|² and |e|⁴ of each block are
@@ -125,8 +127,7 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
         if said >= 0:
             ax, ay = real[said + robot.command], real[said + robot.command + 1]
         move(robot, real, now_ns, until_ns, ax, ay, said >= 0)
-        if robot.says_acceleration:
-            real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
+        real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
         now_ns = until_ns
 
 
@@ -169,7 +170,8 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
 
 @compiled
 def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> bool:
-    """Sends a robot's state and adds up the torques of the period that ends; returns whether all of it is finite."""
+    """Sends a robot's state and adds up the torques of the period that ends; returns whether it is within the bounds of
+    all messages (`admission.within`): finite, too."""
     at, place = robot.at, room(stream, whole)
     x, y, theta, v, omega = real[robot.place], real[robot.place + 1], real[at + THETA], real[at + V], real[at + OMEGA]
     c, s, across = real[at + COS], real[at + SIN], robot.offset * omega
@@ -197,7 +199,11 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
             real[at + S_SATURATED] += saturated
             if time_ns > STARTED_NS:
                 real[at + S_LATE] += saturated
-    return isfinite(x + y + vx + vy + theta + omega + right + left + peak)
+    ax, ay = real[at + A_X], real[at + A_Y]
+    moves = x * x + y * y + vx * vx + vy * vy + theta * theta + v * v + omega * omega + ax * ax + ay * ay
+    right, left = right / robot.torque_periods, left / robot.torque_periods  # mean squares: the other torques are below
+    square: float = moves + right * right + left * left
+    return square <= _LARGEST_SQUARE  # false for NaN
 
 
 @compiled

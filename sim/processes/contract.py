@@ -15,6 +15,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
@@ -37,6 +38,17 @@ FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
 members and end with the run."""
 READY_TIMEOUT_S: Final = 60.0
 """How long a process waits for its peers [s]: on a busy machine, or one processor for all, imports take their time"""
+
+
+class EndsAt(Enum):
+    """Where a run ends before its duration is over."""
+
+    DIVERGED = auto()
+    """At the first instant at which a robot has diverged: it is beyond its reach (`sim.parts.reach`), or as for UNBOUNDED"""
+    UNBOUNDED = auto()
+    """At the first instant at which a state is not finite or beyond all bounds (`admission.within`)"""
+    NOWHERE = auto()
+    """It goes on to its end"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +86,8 @@ class ProcessSpec:
     """A URL for each bus of the plan; empty: no bus"""
     scenario_toml: str = ""
     metadata: dict[str, str] = field(default_factory=dict)
-    keep_going: bool = False
-    """The run goes on though a robot's state is not finite"""
+    ends_at: EndsAt = EndsAt.DIVERGED
+    """Where the run ends before its duration is over"""
     part_files: dict[str, str] = field(default_factory=dict)
     """Texts of the files of users' parts, by their names in the run's folder"""
     every_ns: int = 0

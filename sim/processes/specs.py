@@ -10,7 +10,7 @@ from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import loopback_endpoints
 from echelon.runtime.wire import data_key, run_keys, token_key, watch_key
 from echelon.sim.observing import Gate
-from echelon.sim.processes.contract import FINISHING, ProcessSpec
+from echelon.sim.processes.contract import FINISHING, EndsAt, ProcessSpec
 
 NOBODY: Final = Credentials(Identity("", "", "", ()))
 """Credentials before `introduced` has made them"""
@@ -26,7 +26,7 @@ def list_specs(
     metadata: dict[str, str],
     part_files: dict[str, str],
     recorded: bool,
-    keep_going: bool,
+    ends_at: EndsAt,
     gate: Gate | None = None,
     every_ns: int = 0,
 ) -> list[ProcessSpec]:
@@ -60,7 +60,7 @@ def list_specs(
         "scenario_toml": scenario_toml,
         "metadata": metadata,
         "part_files": part_files,
-        "keep_going": keep_going,
+        "ends_at": ends_at,
         "every_ns": every_ns,
         "credentials": NOBODY,
     }

@@ -32,7 +32,7 @@ from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.observing import new_gate
 from echelon.sim.processes.children import Child, last_words_of, start, warm_up
-from echelon.sim.processes.contract import ProcessSpec
+from echelon.sim.processes.contract import EndsAt, ProcessSpec
 from echelon.sim.processes.endings import also_killed, finish_watchers, stop_members, stop_wheels, take_down
 from echelon.sim.processes.failures import NAMED, DivergedError, RunError, StallError, few
 from echelon.sim.processes.hearing import Hearing
@@ -63,10 +63,10 @@ class Supervisor:
     clock.  `can_urls` has a URL for each bus; without it there are no frames.  `scenario_toml`, `metadata` and `part_files`
     (texts by file name) go into the recording, unless the run is not `recorded`.  `show` is called with the progress about
     five times a second.  A run in virtual time without progress for `stall_timeout_s` is given up; one that is not recorded
-    shows no progress, and must be over by then.  One on a wall clock is given up if a member stands still for as long.  With
-    `keep_going` the run does not stop when a robot has diverged.
-    With `observe` it is open to observers, who get the `ticket`.  `interrupted` notes the signals that ask the run to end;
-    without it the supervisor notes them itself.  On a wall clock only the messages of one instant in every `every_ns` are
+    shows no progress, and must be over by then.  One on a wall clock is given up if a member stands still for as long.
+    `ends_at` says where the run ends before its duration is over.  With `observe` it is open to observers, who get the
+    `ticket`.  `interrupted` notes the signals that ask the run to end; without it the supervisor notes them itself.  On a wall
+    clock only the messages of one instant in every `every_ns` are
     recorded, if it is given (`sim.wall_load`).  `order` may change the order in which processes start."""
 
     def __init__(
@@ -83,7 +83,7 @@ class Supervisor:
         recorded: bool = True,
         show: Callable[[Progress], None] = lambda progress: None,
         stall_timeout_s: float = 30.0,
-        keep_going: bool = False,
+        ends_at: EndsAt = EndsAt.DIVERGED,
         observe: bool = False,
         interrupted: Interruption | None = None,
         every_ns: int = 0,
@@ -98,9 +98,7 @@ class Supervisor:
         gate = new_gate(run) if observe else None
         self.ticket = None if gate is None else gate.ticket
         """What observers need to know; None if the run is not open to them"""
-        self._specs = order(
-            list_specs(plan, run, virtual, folder, can_urls, *told, recorded, keep_going, gate, every_ns)
-        )
+        self._specs = order(list_specs(plan, run, virtual, folder, can_urls, *told, recorded, ends_at, gate, every_ns))
         self._children: list[Child] = []
         self._hearing = Hearing(plan, self._children, self.progress)
         self._stalls = StallWatch(plan, self._children, self.progress, stall_timeout_s)

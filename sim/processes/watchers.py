@@ -23,7 +23,7 @@ from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Session
 from echelon.runtime.wire import WireError, split
 from echelon.sim.parts.reach import ReachWatch
-from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet, tell, watch_keys
+from echelon.sim.processes.contract import EndsAt, ProcessSpec, StartError, finish, hear_finish, meet, tell, watch_keys
 from echelon.sim.processes.to_supervisor import Lost, RecorderProgress, RecorderReport
 from echelon.sim.processes.watch import Watch
 from echelon.sim.recording.recorder import Recorder
@@ -143,7 +143,7 @@ def run_recorder(spec: ProcessSpec, session: Session, control: Connection, watch
     reception = Reception(spec, session, sources, high_water, None if spec.virtual else HOLD_S)
     try:
         recording = RunRecorder(
-            Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files, spec.keep_going, spec.every_ns
+            Path(spec.folder), plan, spec.scenario_toml, spec.metadata, spec.part_files, spec.ends_at, spec.every_ns
         )
     except OSError as error:
         raise StartError(f"{error.filename}: {error.strerror}") from None
@@ -171,9 +171,7 @@ class RunRecorder:
 
     With `every_ns` only the first message of each source and channel in every such time is recorded; frames all are.
 
-    Both end with the first instant at which a robot's state is not finite or beyond all bounds (`admission.within`), since soon
-    after that no state is finite, or at which a robot is beyond its reach (`sim.parts.reach`).  With `keep_going` they go on to
-    the end."""
+    Both end where the run ends (`EndsAt`): soon after a state beyond all bounds no state is finite."""
 
     def __init__(
         self,
@@ -182,7 +180,7 @@ class RunRecorder:
         scenario_toml: str,
         metadata: dict[str, str],
         part_files: Mapping[str, str] = MappingProxyType({}),
-        keep_going: bool = False,
+        ends_at: EndsAt = EndsAt.DIVERGED,
         every_ns: int = 0,
     ) -> None:
         self._every_ns = every_ns
@@ -197,15 +195,16 @@ class RunRecorder:
         """The first state that is not finite, or beyond all bounds, or of a robot beyond its reach"""
         self._time_ns = 0
         self._bridge = len(plan.formation)
-        self._reach = None if keep_going else ReachWatch(plan)
+        self._ends_at = ends_at
+        self._reach = ReachWatch(plan) if ends_at is EndsAt.DIVERGED else None
 
     def add(self, messages: Sequence[Message]) -> None:
         """Takes messages in order of time."""
         recorder, trace = self.recorder, self._trace
-        if self.lost is None and self._reach is not None:
+        if self.lost is None and self._ends_at is not EndsAt.NOWHERE:
             states = [message for message in messages if message.channel is Channel.STATE]
             self.lost = _first_lost(states)
-            beyond = self._reach.first(states)
+            beyond = None if self._reach is None else self._reach.first(states)
             if beyond is not None and (self.lost is None or beyond[1] < self.lost.time_ns):
                 robot, time_ns, far = beyond
                 self.lost = Lost(robot, time_ns, True, far)

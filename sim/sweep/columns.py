@@ -33,7 +33,9 @@ RUN_MEASURES: Final = (
     Column("verdict", "", "HOLDS, HEALTHY or FAILS, as for a single run (scenario.md, `health`)", text=True),
     Column("holds", "", "1 if the verdict is not FAILS, otherwise 0", whole=True),
     Column("reason", "", "names of the checks that failed, and of the blocks; empty if none did", text=True),
-    Column("lost_at", "s", "first instant with a state that is not finite; empty if there is none"),
+    Column(
+        "lost_at", "s", "first instant with a state that is not finite or beyond all bounds; empty if there is none"
+    ),
     Column("smallest_distance", "m", "smallest distance of two robots"),
     Column("violations", "", "number of violations of the avoidance radius", whole=True),
     Column("saturation", "", "largest share of the time in which limits of a robot acted"),

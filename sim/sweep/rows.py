@@ -8,6 +8,7 @@ import numpy as np
 
 from echelon.messages import Channel
 from echelon.plan.plan import Plan
+from echelon.runtime.admission import rows_within
 from echelon.sim.batch.outcomes import BatchRuns
 from echelon.sim.results.block_series import block_series
 from echelon.sim.results.ending import growth_of, levels
@@ -120,11 +121,9 @@ def _largest(values: Iterable[float | None]) -> float:
 
 
 def _lost_at(trace: Trace) -> float:
-    """Returns the first instant at which a robot's state is not finite [s]; NaN if there is none."""
-    first = [
-        times_ns[~np.isfinite(states).all(axis=1)][:1]
-        for times_ns, states in zip(trace.times_ns, trace.states, strict=True)
-    ]
+    """Returns the first instant at which a robot's state is not finite or beyond all bounds [s]; NaN if there is
+    none."""
+    first = [times_ns[~rows_within(states)][:1] for times_ns, states in zip(trace.times_ns, trace.states, strict=True)]
     found = [int(times_ns[0]) for times_ns in first if len(times_ns)]
     return min(found) / 1e9 if found else nan
 

@@ -7,10 +7,9 @@ from math import gcd
 from pathlib import Path
 from typing import Final, Literal
 
-import numpy as np
-
 from echelon.errors import PartRunError
 from echelon.plan.plan import Plan
+from echelon.runtime.admission import rows_within
 from echelon.scenario.tables import Scenario
 from echelon.sim.engines.in_process import Engine
 from echelon.sim.results.records import RunFacts
@@ -65,14 +64,14 @@ def joined(parts: Sequence[Rows]) -> Rows:
 
 
 def _in_process(scenario: Scenario, plan: Plan) -> Rows:
-    """Makes one run in this process, without a recording; it ends at the first state that is not finite."""
+    """Makes one run in this process, without a recording; it ends where one as processes does."""
     builder, failure, stopped = TraceBuilder(plan), None, None
     engine = Engine(plan, builder.add)
     try:
         for time_ns in engine.instants():
             last = builder.last()
-            if last is not None and not np.isfinite(last[1]).all():
-                stopped = f"stopped at t = {time_ns / 1e9:g} s: a state is not finite"
+            if last is not None and not rows_within(last[1]).all():
+                stopped = f"stopped at t = {time_ns / 1e9:g} s: a state is not finite, or beyond all bounds"
                 break
     except PartRunError as error:
         failure = str(error)
@@ -82,11 +81,16 @@ def _in_process(scenario: Scenario, plan: Plan) -> Rows:
 
 
 def _as_processes(scenario: Scenario, plan: Plan) -> Rows:
-    """Makes one run as processes, in a folder that is deleted afterwards."""
+    """Makes one run as processes, in a folder that is deleted afterwards.
+
+    As with the other engines, an error that grows slowly does not end it, since the table tells how far it grows."""
     from echelon.sim.launch import Launch, launch  # takes long to import
+    from echelon.sim.processes.contract import EndsAt
 
     can = None if plan.can.closed else "none"
     with tempfile.TemporaryDirectory(prefix="echelon-sweep-") as folder:
-        options = Launch(engine="processes", out=Path(folder), can=can, report=False, quiet=True)
+        options = Launch(
+            engine="processes", out=Path(folder), can=can, report=False, quiet=True, ends_at=EndsAt.UNBOUNDED
+        )
         run = launch(scenario.model_copy(update={"seed": plan.seed}), plan, options)
         return row_of_run(run.trace, run.summary)

@@ -24,7 +24,7 @@ from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.paced import PacedRunner
 from echelon.runtime.wire import data_key, encode, join
 from echelon.sim.engines.in_process import Engine, make_role
-from echelon.sim.processes.contract import watch_keys
+from echelon.sim.processes.contract import EndsAt, watch_keys
 from echelon.sim.processes.watchers import Reception
 from echelon.sim.recording.time_order import speakers
 from support.hostile import Heard, mutated, refused
@@ -302,7 +302,7 @@ def test_a_recording_takes_whatever_is_admitted(virtual: bool, tmp_path: Any, mo
     monkeypatch.setattr(watchers, "time", clock)
     sources = list(speakers(plan, virtual, has_bus=True))
     copies = Copies(plan, virtual=virtual, sources=sources)
-    recording = watchers.RunRecorder(tmp_path, plan, "scenario", {}, keep_going=True)
+    recording = watchers.RunRecorder(tmp_path, plan, "scenario", {}, ends_at=EndsAt.NOWHERE)
     luck, fed = np.random.default_rng(2), 0
     wanted = [message for message in messages if message.source in sources]
     for message in wanted:

@@ -10,6 +10,7 @@ import pytest
 from echelon.errors import UsageError
 from echelon.messages import STATE_FIELDS, field_index
 from echelon.plan.plan import Plan
+from echelon.runtime.admission import within
 from echelon.sim.batch.batch import run_many
 from echelon.sim.batch.outcomes import BatchRuns
 from echelon.sim.engines.in_process import Engine
@@ -24,12 +25,12 @@ from support.runs import EXAMPLES, plan_of
 
 
 def in_process(plan: Plan) -> tuple[Trace, Summary]:
-    """Runs a plan in process, to the first instant with a state that is not finite."""
+    """Runs a plan in process, to the first instant with a state that is not finite or out of bounds."""
     builder = TraceBuilder(plan)
     engine = Engine(plan, builder.add)
     for _ in engine.instants():
         last = builder.last()
-        if last is not None and not np.isfinite(last[1]).all():
+        if last is not None and not all(map(within, last[1])):
             break
     trace = builder.build()
     facts = RunFacts("inprocess", "virtual", 0.0, 0.0, None, None, engine.messages, None)

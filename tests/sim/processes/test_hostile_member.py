@@ -17,6 +17,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.credentials import Credentials, new_identity
 from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, encode, join, run_keys, watch_key
+from echelon.sim.processes.contract import EndsAt
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.recording.mcap_reader import read_trace
 from support.hostile import Heard, refused
@@ -105,7 +106,7 @@ def test_a_member_that_floods_the_run_changes_nothing_and_is_named(path: str, vi
 def test_a_member_that_lies_ends_no_run_and_is_named(virtual: bool, tmp_path: Path) -> None:
     """Numbers that it has taken are missing from the true robot."""
     plan = plan_of("lab", "duration=2.0")
-    supervisor = Supervisor(plan, tmp_path, run=f"hostile-{os.getpid()}", virtual=virtual, keep_going=True)
+    supervisor = Supervisor(plan, tmp_path, run=f"hostile-{os.getpid()}", virtual=virtual, ends_at=EndsAt.NOWHERE)
     with HostileMember(supervisor, plan, ahead(plan)):
         outcome = supervisor.run()
     assert outcome.failure is None

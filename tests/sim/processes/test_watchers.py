@@ -16,7 +16,7 @@ from echelon.runtime.admission import AGAIN, EMPTY, FUTURE, MISSHAPEN, OF_ANOTHE
 from echelon.runtime.session import Session
 from echelon.runtime.wire import encode, join
 from echelon.sim.processes import watchers
-from echelon.sim.processes.contract import watch_keys
+from echelon.sim.processes.contract import EndsAt, watch_keys
 from echelon.sim.processes.to_supervisor import Lost
 from echelon.sim.processes.watchers import LATE, LEAD, Reception, RunRecorder
 from echelon.sim.recording.mcap_reader import read_metadata, read_trace
@@ -189,9 +189,9 @@ def test_recording_keeps_messages_trace_and_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200, 1e14])
-@pytest.mark.parametrize("keep_going", [False, True])
+@pytest.mark.parametrize("ends_at", EndsAt)
 def test_a_recording_ends_with_the_instant_at_which_a_state_is_not_finite(
-    tmp_path: Path, value: float, keep_going: bool
+    tmp_path: Path, value: float, ends_at: EndsAt
 ) -> None:
     messages = list(invented(paper(), TICKS))
     instants = sorted({message.time_ns for message in messages})
@@ -201,11 +201,11 @@ def test_a_recording_ends_with_the_instant_at_which_a_state_is_not_finite(
             values = message.values.copy()
             values[-1] = value
             messages[number] = message._replace(values=values)
-    recording = RunRecorder(tmp_path, paper(), "scenario", METADATA, keep_going=keep_going)
+    recording = RunRecorder(tmp_path, paper(), "scenario", METADATA, ends_at=ends_at)
     recording.add(messages)
     recording.close([])
     result = recording.report()
-    if keep_going or value == 1e14:  # large, but within the bounds
+    if ends_at is EndsAt.NOWHERE or value == 1e14:  # large, but within the bounds
         assert (result.lost, result.stopped(paper())) == (None, None)
         assert result.messages == len(messages)
     else:

@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 from functools import cache
+from math import isfinite
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from echelon.sim.launch import Launch, launch
 from echelon.sim.parts.loading import load
 from echelon.sim.sweep.columns import measures
 from echelon.sim.sweep.rows import Rows, blocks_of, channels_of
@@ -95,11 +98,30 @@ def test_rows_have_the_columns_of_the_tables() -> None:
     assert list(rows_of("holds", "batch")) == names
 
 
+ENDS = {
+    "at its end": ("lab", "duration=2", LATE),
+    "at its end, far beyond its reach": ("lab", "law.epsilon=[0.02,0.02]", "duration=10"),
+    "beyond all bounds": ("paper", "links=[{channel='state', delay=0.007}]", "duration=2"),
+}
+
+
 @pytest.mark.slow
-def test_a_run_as_processes_gives_the_same_row() -> None:
-    scenario, plan = load(SCENARIOS / "lab.toml", ["duration=2", LATE, "claims=[]"])
-    one, other = (work(Task("", plan, (5,), engine, scenario)) for engine in ("processes", "inprocess"))
+@pytest.mark.parametrize("where", ENDS)
+def test_a_run_that_ends_somewhere_has_the_same_row_with_all_engines(where: str, tmp_path: Path) -> None:
+    name, *changes = ENDS[where]
+    scenario, plan = load(SCENARIOS / f"{name}.toml", [*changes, "claims=[]"])
+    one, other, third = (work(Task("", plan, (5,), engine, scenario)) for engine in ("processes", "inprocess", "batch"))
+    if where == "beyond all bounds":  # as processes, whoever gets such a state refuses it
+        assert one["reason"] == [f"{other['reason'][0]}; refused"]
+        one["reason"] = other["reason"]
     assert str(one) == str(other)  # NaN is equal to NaN then
+    assert [*one["lost_at"], *one["holds"]] == pytest.approx([*third["lost_at"], *third["holds"]], nan_ok=True)
+    assert isfinite(one["lost_at"][0]) == (where == "beyond all bounds")
+    if where == "at its end, far beyond its reach":
+        options = Launch(engine="inprocess", out=tmp_path, can="none", report=False, quiet=True)
+        stopped = launch(scenario, plan, options).run.stopped
+        assert stopped is not None
+        assert "has diverged" in stopped
 
 
 def test_a_row_depends_on_its_own_seed_alone() -> None:

@@ -40,6 +40,8 @@ from echelon.sim.batch.records import (
 from echelon.sim.batch.streams import change_ns, finish, hear, room, say, take_up
 
 _LARGEST_SQUARE: Final = LARGEST * LARGEST
+_SMALL: Final = 1e-3 * LARGEST
+"""Where the sum of the magnitudes of a state is below, the state is within bounds"""
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
 
@@ -127,7 +129,8 @@ def _obey(run: Any, robot: Any, link: Any, index: Any, real: Any, whole: Any, du
         if said >= 0:
             ax, ay = real[said + robot.command], real[said + robot.command + 1]
         move(robot, real, now_ns, until_ns, ax, ay, said >= 0)
-        real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
+        if robot.says_acceleration:
+            real[robot.at + A_X], real[robot.at + A_Y] = ax, ay
         now_ns = until_ns
 
 
@@ -199,9 +202,11 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
             real[at + S_SATURATED] += saturated
             if time_ns > STARTED_NS:
                 real[at + S_LATE] += saturated
-    ax, ay = real[at + A_X], real[at + A_Y]
-    moves = x * x + y * y + vx * vx + vy * vy + theta * theta + v * v + omega * omega + ax * ax + ay * ay
-    right, left = right / robot.torque_periods, left / robot.torque_periods  # mean squares: the other torques are below
+    if abs(x) + abs(y) + abs(v) + abs(theta) + abs(omega) + right + left < _SMALL:
+        return True
+    # The mean squares of the torques are much larger than the torques and the accelerations.
+    right, left = right / robot.torque_periods, left / robot.torque_periods
+    moves = x * x + y * y + vx * vx + vy * vy + theta * theta + v * v + omega * omega
     square: float = moves + right * right + left * left
     return square <= _LARGEST_SQUARE  # false for NaN
 

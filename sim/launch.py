@@ -19,7 +19,7 @@ from echelon.sim.finished_run import Run
 from echelon.sim.interruption import Interruption, interruption
 from echelon.sim.out_folder import REPORT, OutFolder, out_folder, run_files
 from echelon.sim.processes.children import warm_up
-from echelon.sim.processes.contract import EndsAt
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.results.can_lines import some
 from echelon.sim.run import execute
 from echelon.sim.view.live import Display

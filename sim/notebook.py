@@ -18,7 +18,7 @@ from echelon.sim import run_folder
 from echelon.sim.finished_run import Run
 from echelon.sim.launch import Launch, launch
 from echelon.sim.parts import loading as parts
-from echelon.sim.processes.contract import EndsAt
+from echelon.sim.processes.ends_at import EndsAt
 
 if TYPE_CHECKING:
     from echelon.sim.replay.difference import RunDifference

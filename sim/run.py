@@ -34,7 +34,7 @@ from echelon.sim.observing import TICKET
 from echelon.sim.out_folder import NOTE, SUMMARY, OutFolder, run_files
 from echelon.sim.parts.foreign_parts import patience_with_bridge, stalled_in, unstalled
 from echelon.sim.parts.time_limit import TookTooLong
-from echelon.sim.processes.contract import EndsAt
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.outcome import Outcome, Progress
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.processes.watchers import RunRecorder

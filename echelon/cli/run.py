@@ -8,7 +8,7 @@ from typing import Final, Literal
 from echelon.cli.options import Command, option
 from echelon.cli.shared import ScenarioOptions, seconds
 from echelon.sim.interruption import interruption
-from echelon.sim.processes.contract import EndsAt
+from echelon.sim.processes.ends_at import EndsAt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,6 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
@@ -29,6 +28,7 @@ from echelon.runtime.runner import RunnerCounts
 from echelon.runtime.session import Session
 from echelon.runtime.wire import SCHEMA_VERSION, token_key, watch_key
 from echelon.sim.observing import Gate
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.to_process import Finish, Start
 from echelon.sim.processes.to_supervisor import Done, Failed, PartFailed, Ready, Report, Said
 from echelon.sim.processes.watch import STOP, Watch
@@ -38,17 +38,6 @@ FINISHING: Final = ("bridge", "drives", "referee", "recorder", "observers")
 members and end with the run."""
 READY_TIMEOUT_S: Final = 60.0
 """How long a process waits for its peers [s]: on a busy machine, or one processor for all, imports take their time"""
-
-
-class EndsAt(Enum):
-    """Where a run ends before its duration is over."""
-
-    DIVERGED = auto()
-    """At the first instant at which a robot has diverged: it is beyond its reach (`sim.parts.reach`), or as for UNBOUNDED"""
-    UNBOUNDED = auto()
-    """At the first instant at which a state is not finite or beyond all bounds (`admission.within`)"""
-    NOWHERE = auto()
-    """It goes on to its end"""
 
 
 @dataclass(frozen=True, slots=True)

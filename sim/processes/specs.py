@@ -10,7 +10,8 @@ from echelon.runtime.credentials import Credentials, Identity, new_identity
 from echelon.runtime.session import loopback_endpoints
 from echelon.runtime.wire import data_key, run_keys, token_key, watch_key
 from echelon.sim.observing import Gate
-from echelon.sim.processes.contract import FINISHING, EndsAt, ProcessSpec
+from echelon.sim.processes.contract import FINISHING, ProcessSpec
+from echelon.sim.processes.ends_at import EndsAt
 
 NOBODY: Final = Credentials(Identity("", "", "", ()))
 """Credentials before `introduced` has made them"""

@@ -32,8 +32,9 @@ from echelon.runtime.arrivals import FILE as ARRIVALS
 from echelon.sim.interruption import Interruption, Raises, interruption
 from echelon.sim.observing import new_gate
 from echelon.sim.processes.children import Child, last_words_of, start, warm_up
-from echelon.sim.processes.contract import EndsAt, ProcessSpec
+from echelon.sim.processes.contract import ProcessSpec
 from echelon.sim.processes.endings import also_killed, finish_watchers, stop_members, stop_wheels, take_down
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.failures import NAMED, DivergedError, RunError, StallError, few
 from echelon.sim.processes.hearing import Hearing
 from echelon.sim.processes.outcome import Outcome, Progress, outcome_of

@@ -23,7 +23,8 @@ from echelon.runtime.link import LinkCounts
 from echelon.runtime.session import Session
 from echelon.runtime.wire import WireError, split
 from echelon.sim.parts.reach import ReachWatch
-from echelon.sim.processes.contract import EndsAt, ProcessSpec, StartError, finish, hear_finish, meet, tell, watch_keys
+from echelon.sim.processes.contract import ProcessSpec, StartError, finish, hear_finish, meet, tell, watch_keys
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.to_supervisor import Lost, RecorderProgress, RecorderReport
 from echelon.sim.processes.watch import Watch
 from echelon.sim.recording.recorder import Recorder

@@ -12,6 +12,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.admission import rows_within
 from echelon.scenario.tables import Scenario
 from echelon.sim.engines.in_process import Engine
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.results.records import RunFacts
 from echelon.sim.results.summary import summarise
 from echelon.sim.results.trace import TraceBuilder
@@ -85,7 +86,6 @@ def _as_processes(scenario: Scenario, plan: Plan) -> Rows:
 
     As with the other engines, an error that grows slowly does not end it, since the table tells how far it grows."""
     from echelon.sim.launch import Launch, launch  # takes long to import
-    from echelon.sim.processes.contract import EndsAt
 
     can = None if plan.can.closed else "none"
     with tempfile.TemporaryDirectory(prefix="echelon-sweep-") as folder:

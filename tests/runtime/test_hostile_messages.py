@@ -24,7 +24,8 @@ from echelon.runtime.lockstep import LockstepRunner
 from echelon.runtime.paced import PacedRunner
 from echelon.runtime.wire import data_key, encode, join
 from echelon.sim.engines.in_process import Engine, make_role
-from echelon.sim.processes.contract import EndsAt, watch_keys
+from echelon.sim.processes.contract import watch_keys
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.watchers import Reception
 from echelon.sim.recording.time_order import speakers
 from support.hostile import Heard, mutated, refused

@@ -17,7 +17,7 @@ from echelon.plan.plan import Plan
 from echelon.runtime.credentials import Credentials, new_identity
 from echelon.runtime.session import Session
 from echelon.runtime.wire import data_key, encode, join, run_keys, watch_key
-from echelon.sim.processes.contract import EndsAt
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.supervisor import Supervisor
 from echelon.sim.recording.mcap_reader import read_trace
 from support.hostile import Heard, refused

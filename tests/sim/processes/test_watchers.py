@@ -16,7 +16,8 @@ from echelon.runtime.admission import AGAIN, EMPTY, FUTURE, MISSHAPEN, OF_ANOTHE
 from echelon.runtime.session import Session
 from echelon.runtime.wire import encode, join
 from echelon.sim.processes import watchers
-from echelon.sim.processes.contract import EndsAt, watch_keys
+from echelon.sim.processes.contract import watch_keys
+from echelon.sim.processes.ends_at import EndsAt
 from echelon.sim.processes.to_supervisor import Lost
 from echelon.sim.processes.watchers import LATE, LEAD, Reception, RunRecorder
 from echelon.sim.recording.mcap_reader import read_metadata, read_trace

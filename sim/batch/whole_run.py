@@ -40,8 +40,6 @@ from echelon.sim.batch.records import (
 from echelon.sim.batch.streams import change_ns, finish, hear, room, say, take_up
 
 _LARGEST_SQUARE: Final = LARGEST * LARGEST
-_SMALL: Final = 1e-3 * LARGEST
-"""Where the sum of the magnitudes of a state is below, the state is within bounds"""
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
 
@@ -202,12 +200,10 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
             real[at + S_SATURATED] += saturated
             if time_ns > STARTED_NS:
                 real[at + S_LATE] += saturated
-    if abs(x) + abs(y) + abs(v) + abs(theta) + abs(omega) + right + left < _SMALL:
-        return True
-    # The mean squares of the torques are much larger than the torques and the accelerations.
-    right, left = right / robot.torque_periods, left / robot.torque_periods
-    moves = x * x + y * y + vx * vx + vy * vy + theta * theta + v * v + omega * omega
-    square: float = moves + right * right + left * left
+    # vx² + vy² is v² + across².  The mean squares of the torques are much larger than the torques and the accelerations.
+    moves = x * x + y * y + theta * theta + omega * omega + 2.0 * v * v + across * across
+    periods = robot.torque_periods
+    square: float = moves + (right * right + left * left) / (periods * periods)
     return square <= _LARGEST_SQUARE  # false for NaN
 
 

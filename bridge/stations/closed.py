@@ -60,7 +60,9 @@ class ClosedBridge(Bridge):
             self.stages = on_bus(self.stages, self.rail, is_bridge=True, said=self.log)
 
     def take(self, messages: Sequence[Message], copies: list[Message]) -> None:
-        """Shows the frames of its own role on the buses.  Adds no copies: recorders get the messages of the role."""
+        """Shows the frames of its own role on the buses.  Adds no copies: recorders get the messages of the role.
+
+        Raises SystemExit if it is interrupted while a bus takes no frames."""
         for message in messages:
             if message.channel is Channel.FRAMES and message.source == self.index:
                 frames = frames_of(message)

@@ -195,19 +195,17 @@ class WallBridge(Bridge):
     def _carry(self, now_ns: int) -> None:
         """Sends the frames that the buses can have carried by now; measures the latency of torques."""
         with self._sending:
-            for number, bus in enumerate([] if self._stopped else self._buses):
-                self._carry_on(now_ns, number, bus)
-
-    def _carry_on(self, now_ns: int, number: int, bus: PacedBus) -> None:
-        for queued_ns, _, _, frame in bus.run(now_ns):
-            self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
-            awaited = self._awaited.get((number, frame.can_id))
-            while awaited and awaited[0][0] < queued_ns:
-                awaited.popleft()  # this frame was lost
-            if awaited and awaited[0][0] == queued_ns:
-                latency_ns = now_ns - awaited.popleft()[1]
-                self.latencies.append(latency_ns)
-                self.in_time += latency_ns < self._period_ns
+            carried = [] if self._stopped else [bus.run(now_ns) for bus in self._buses]
+            for number, delivered in enumerate(carried):
+                for queued_ns, _, _, frame in delivered:
+                    self._note(TimedFrame(now_ns, number, BRIDGE_NODE, frame))
+                    awaited = self._awaited.get((number, frame.can_id))
+                    while awaited and awaited[0][0] < queued_ns:
+                        awaited.popleft()  # this frame was lost
+                    if awaited and awaited[0][0] == queued_ns:
+                        latency_ns = now_ns - awaited.popleft()[1]
+                        self.latencies.append(latency_ns)
+                        self.in_time += latency_ns < self._period_ns
 
     def stop(self) -> None:
         """Takes the torque away from all wheels and disables their drives."""

@@ -39,6 +39,7 @@ from echelon.runtime.wire import HEADER, SCHEMA_VERSION, WireError, decode
 LARGEST: Final = 1e15
 """Bound of the root of the sum of squares of a message's values, each in its SI unit.  No formation is as far, as fast or as
 strong; a run whose states are larger has diverged"""
+LARGEST_SQUARE: Final = LARGEST * LARGEST
 EARLY_NS: Final = 10_000_000_000
 """On a wall clock a process that does not know yet when the run starts takes messages of so much run time [ns]"""
 OF_ANOTHER: Final = "of another source or channel"
@@ -65,7 +66,6 @@ _view: Final = np.frombuffer
 _product: Final = np.vdot  # unlike `dot` it warns of nothing
 _FEW: Final = 16
 """For so many values `hypot` is faster"""
-_LARGEST_SQUARE: Final = LARGEST * LARGEST
 
 
 class Refusals:
@@ -204,11 +204,11 @@ def within(values: Values) -> bool:
     `LARGEST`."""
     if values.size <= _FEW:
         return hypot(*values.tolist()) <= LARGEST  # false for NaN
-    return bool(_product(values, values) <= _LARGEST_SQUARE)  # a sum may overflow
+    return bool(_product(values, values) <= LARGEST_SQUARE)  # a sum may overflow
 
 
 def rows_within(rows: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Returns for each row of values, (…, n), what `within` says of it, (…)."""
     with np.errstate(all="ignore"):  # a sum may overflow
-        found: NDArray[np.bool_] = np.einsum("...n,...n->...", rows, rows) <= _LARGEST_SQUARE
+        found: NDArray[np.bool_] = np.einsum("...n,...n->...", rows, rows) <= LARGEST_SQUARE
     return found

@@ -3,7 +3,7 @@
 from math import cos, inf, isfinite, sin
 from typing import Any, Final
 
-from echelon.runtime.admission import LARGEST
+from echelon.runtime.admission import LARGEST_SQUARE
 from echelon.sim.batch.compiled import compiled, is_kept
 from echelon.sim.batch.late_states import begin_commands
 from echelon.sim.batch.measures import measure
@@ -39,7 +39,6 @@ from echelon.sim.batch.records import (
 )
 from echelon.sim.batch.streams import change_ns, finish, hear, room, say, take_up
 
-_LARGEST_SQUARE: Final = LARGEST * LARGEST
 STARTED_NS: Final = 1_000_000_000
 """Saturation in the first second is counted apart (sim.results.measures)"""
 
@@ -171,8 +170,8 @@ def _start(run: Any, robots: Any, nodes: Any, blocks: Any, links: Any, keys: Any
 
 @compiled
 def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> bool:
-    """Sends a robot's state and adds up the torques of the period that ends; returns whether it is within the bounds of
-    all messages (`admission.within`): finite, too."""
+    """Sends a robot's state and adds up the torques of the period that ends; returns whether the state is within the
+    bounds of all messages (`echelon.runtime.admission`), and so finite."""
     at, place = robot.at, room(stream, whole)
     x, y, theta, v, omega = real[robot.place], real[robot.place + 1], real[at + THETA], real[at + V], real[at + OMEGA]
     c, s, across = real[at + COS], real[at + SIN], robot.offset * omega
@@ -200,11 +199,12 @@ def _say_state(robot: Any, stream: Any, real: Any, whole: Any, time_ns: int) -> 
             real[at + S_SATURATED] += saturated
             if time_ns > STARTED_NS:
                 real[at + S_LATE] += saturated
-    # vx² + vy² is v² + across².  The mean squares of the torques are much larger than the torques and the accelerations.
-    moves = x * x + y * y + theta * theta + omega * omega + 2.0 * v * v + across * across
+    # vx² + vy² is v² + across².  The mean squares of torques are much larger than the torques, where any of them matters here.
+    # Commanded accelerations are left out, which saves time: they show in the torques, unless limits cut those.
     periods = robot.torque_periods
+    moves = x * x + y * y + theta * theta + omega * omega + 2.0 * v * v + across * across
     square: float = moves + (right * right + left * left) / (periods * periods)
-    return square <= _LARGEST_SQUARE  # false for NaN
+    return square <= LARGEST_SQUARE  # false for NaN
 
 
 @compiled

@@ -11,6 +11,7 @@ import pytest
 from echelon.bridge.can.bus import Bus
 from echelon.bridge.can.log_files import frames_in
 from echelon.bridge.protocols.native.codec import NativeCodec, Torque
+from echelon.bridge.stations import waiting
 from echelon.bridge.stations.closed import ClosedBridge
 from echelon.bridge.stations.mirror import TAU_LEFT, TAU_RIGHT, MirrorBridge
 from echelon.bridge.stations.waiting import RunClock
@@ -26,10 +27,13 @@ class StopInTheMiddle:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
         self.frames: list[tuple[int, bytes]] = []
+        self.by_stop: list[bool] = []
+        """Of each frame whether the thread that stops the wheels has sent it"""
         self._at, self._send = at, Bus.send
         self.thread: threading.Thread | None = None
         self.stop: Callable[[], None] = lambda: None
         self.has_stopped: Callable[[], bool] = lambda: True
+        monkeypatch.setattr(waiting, "LAST_S", 600.0)  # on a busy machine the frame below takes long
         monkeypatch.setattr(Bus, "send", lambda bus, *args, **named: self.send(bus, *args, **named))
 
     def send(self, bus: Bus, can_id: int, data: bytes, time_ns: int = 0, remote: bool = False) -> bool:
@@ -38,9 +42,10 @@ class StopInTheMiddle:
             self.thread.start()
             while not self.has_stopped():  # it has said that it stops, and waits for this frame
                 threading.Event().wait(0.001)
-            self.thread.join(0.05)  # as long as it takes if it does not wait
+            self.thread.join(0.05)  # who does not wait is done by then
         taken = self._send(bus, can_id, data, time_ns, remote)
         self.frames.append((can_id, bytes(data)))
+        self.by_stop.append(threading.current_thread() is self.thread)
         return taken
 
     def check(self, log: Path, stops: int) -> None:
@@ -49,12 +54,12 @@ class StopInTheMiddle:
         self.thread.join()
         logged = [(frame.can_id, bytes(frame.data)) for _, _, frame in frames_in(log)]
         assert logged == self.frames
+        assert self.by_stop == sorted(self.by_stop)
         said = [
             found for can_id, data in logged if isinstance(found := NativeCodec(0.001).decode(can_id, data), Torque)
         ]
-        enabled = [one.enable_right for one in said]
-        assert len(enabled) > stops
-        assert enabled[-stops:] == [False] * stops
+        assert [one.enable_right for one in said[-stops:]] == [False] * stops
+        assert stops <= sum(self.by_stop) < len(self.by_stop)
 
 
 def states(robots: int, instants: Sequence[int], period_ns: int) -> list[Message]:
